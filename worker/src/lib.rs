@@ -1,0 +1,3 @@
+//! How light becomes records and records become pixels.
+
+pub mod scene;
