@@ -1,1 +1,39 @@
-//! x
+//! What a record is, where it is filed, how it answers. Pure: no I/O, clock, async or threads.
+//!
+//! In the order of the flow, one sentence each:
+//!
+//! - [`math`]: colours, tangent frames, and the transcendental functions whose bits must not depend on the C library.
+//! - [`id`]: a record's identity is made from what determines it, and so are its random numbers.
+//! - [`cached`]: the first door: what every kind of record must be able to do.
+//! - [`irradiance`]: the room of irradiance: record, weights, gradients, interpolation (Ward 1988, 1992).
+//! - [`null`]: the empty room that proves the door.
+//! - [`hemisphere`]: stratified directions of a gather, and what their samples say: E, both gradients, R.
+//! - [`set`]: id to record, union is the only merge; with its order-free digest.
+//! - [`clamp`]: neighbor clamping in its order-free form (Krivanek 2006).
+//! - [`octree`]: files records by their reach, answers which may count at a point.
+//! - [`sealed`]: a set nothing more will be added to, ready to be asked.
+//! - [`rounds`]: the plan by which a frame is filled, coarse to fine, independent of the farm.
+
+pub mod math;
+
+pub mod id;
+
+pub mod cached;
+pub mod irradiance;
+pub mod null;
+
+pub mod hemisphere;
+
+pub mod clamp;
+pub mod octree;
+pub mod sealed;
+pub mod set;
+
+pub mod rounds;
+
+pub use cached::{Cached, Invalid, Query};
+pub use id::{Namespace, RecordId};
+pub use irradiance::Irradiance;
+pub use math::Rgb;
+pub use sealed::Sealed;
+pub use set::RecordSet;

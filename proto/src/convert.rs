@@ -1,1 +1,173 @@
-//! The only place where bytes from the wire become records.
+//! The only place where bytes from the wire become records, and core's steps become messages.
+
+use cache_core::id::Digest;
+use cache_core::{Cached, Invalid, Namespace, rounds};
+
+use crate::v1;
+
+/// Most records in one batch.
+pub const BATCH_RECORDS_MAX: usize = 4096;
+
+/// Why a message was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum Malformed {
+    /// A fixed-size field of another size.
+    #[error("{field} has {got} bytes, expected {expected}")]
+    Size {
+        /// Which.
+        field: &'static str,
+        /// What there was.
+        got: usize,
+        /// What would have been right.
+        expected: usize,
+    },
+    /// A message field that is absent.
+    #[error("{0} is missing")]
+    Missing(&'static str),
+    /// Records of a kind this build does not know.
+    #[error("records of kind {got}, expected kind {expected}")]
+    Kind {
+        /// What there was.
+        got: u32,
+        /// What would have been right.
+        expected: u32,
+    },
+    /// A level no record can have.
+    #[error("level is {0}, expected 1 to 64")]
+    Level(u32),
+    /// More records than one batch may carry.
+    #[error("batch has {0} bytes of records, expected at most 4096 records")]
+    TooMany(usize),
+    /// A record that is not sound.
+    #[error("record {index} of the batch: {reason}")]
+    Record {
+        /// Which, from 0.
+        index: usize,
+        /// Why.
+        reason: Invalid,
+    },
+}
+
+/// Reads a namespace.
+///
+/// # Errors
+/// [`Malformed::Size`] unless there are 32 bytes.
+pub fn namespace(bytes: &[u8]) -> Result<Namespace, Malformed> {
+    let sized = <[u8; 32]>::try_from(bytes);
+    sized.map(Namespace).map_err(|_| Malformed::Size { field: "namespace", got: bytes.len(), expected: 32 })
+}
+
+/// Reads a digest.
+///
+/// # Errors
+/// [`Malformed::Size`] unless there are 16 bytes.
+pub fn digest(bytes: &[u8]) -> Result<Digest, Malformed> {
+    let sized = <[u8; 16]>::try_from(bytes);
+    let sized = sized.map_err(|_| Malformed::Size { field: "digest", got: bytes.len(), expected: 16 })?;
+    Ok(Digest(u128::from_le_bytes(sized)))
+}
+
+/// Packs a digest.
+pub fn digest_bytes(digest: Digest) -> prost::bytes::Bytes {
+    prost::bytes::Bytes::copy_from_slice(&digest.0.to_le_bytes())
+}
+
+/// Packs records of one level. At most [`BATCH_RECORDS_MAX`] of them make a batch a server accepts.
+pub fn pack<'a, C: Cached>(
+    namespace: &Namespace,
+    level: u32,
+    records: impl IntoIterator<Item = &'a C>,
+) -> v1::RecordBatch {
+    let mut bytes = Vec::new();
+    for record in records {
+        record.encode(&mut bytes);
+    }
+    v1::RecordBatch {
+        namespace: prost::bytes::Bytes::copy_from_slice(&namespace.0),
+        kind: C::KIND,
+        level,
+        records: bytes.into(),
+    }
+}
+
+/// Reads and checks a batch: its namespace, level and records.
+///
+/// # Errors
+/// The first thing that is not sound. Nothing of an unsound batch is used.
+pub fn unpack<C: Cached>(batch: &v1::RecordBatch) -> Result<(Namespace, u32, Vec<C>), Malformed> {
+    let namespace = namespace(&batch.namespace)?;
+    if batch.kind != C::KIND {
+        return Err(Malformed::Kind { got: batch.kind, expected: C::KIND });
+    }
+    if !(1..=64).contains(&batch.level) {
+        return Err(Malformed::Level(batch.level));
+    }
+    if batch.records.len() > BATCH_RECORDS_MAX * C::BYTES {
+        return Err(Malformed::TooMany(batch.records.len()));
+    }
+    let record = |(index, bytes)| C::decode(bytes).map_err(|reason| Malformed::Record { index, reason });
+    let records = batch.records.chunks(C::BYTES).enumerate().map(record).collect::<Result<_, _>>()?;
+    Ok((namespace, batch.level, records))
+}
+
+/// What a step of the plan looks like on the wire, sealed at a position of the namespace's log.
+pub fn step(index: u32, step: &rounds::Step, sealed_position: u64, sealed_digest: Digest) -> v1::Step {
+    let (level, pass, ranks) = match step {
+        rounds::Step::Fill { level, pass, ranks } => (*level, *pass, ranks.clone()),
+        rounds::Step::Pixels => (0, 0, 0..0),
+    };
+    v1::Step {
+        index,
+        level,
+        pass,
+        rank_from: ranks.start,
+        rank_to: ranks.end,
+        sealed_position,
+        sealed_digest: digest_bytes(sealed_digest),
+    }
+}
+
+/// The plan's step in a message.
+pub fn plan_step(step: &v1::Step) -> rounds::Step {
+    match step.level {
+        0 => rounds::Step::Pixels,
+        level => rounds::Step::Fill { level, pass: step.pass, ranks: step.rank_from..step.rank_to },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use cache_core::Irradiance;
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn random_bytes_never_panic_and_never_pass_unsound(bytes in prop::collection::vec(any::<u8>(), 0..600), kind in 0u32..3, level in 0u32..70) {
+            let batch = v1::RecordBatch { namespace: vec![0; 32].into(), kind, level, records: bytes.into() };
+            if let Ok((_, _, records)) = unpack::<Irradiance>(&batch) {
+                for record in records {
+                    prop_assert!(record.check().is_ok());
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_wrong_with_a_batch_is_named() {
+        let batch = |records: Vec<u8>| v1::RecordBatch {
+            namespace: vec![0; 32].into(),
+            kind: Irradiance::KIND,
+            level: 1,
+            records: records.into(),
+        };
+        let message = |b: &v1::RecordBatch| unpack::<Irradiance>(b).expect_err("unsound").to_string();
+        assert!(message(&batch(vec![0; 113])).starts_with("record 0 of the batch: normal"));
+        assert!(message(&batch(vec![0; 4097 * 112])).contains("at most 4096"));
+        assert!(message(&v1::RecordBatch { level: 65, ..batch(vec![]) }).contains("level is 65"));
+        assert!(
+            message(&v1::RecordBatch { namespace: vec![1].into(), ..batch(vec![]) }).contains("namespace has 1 bytes")
+        );
+    }
+}

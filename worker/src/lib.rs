@@ -1,3 +1,5 @@
 //! How light becomes records and records become pixels.
 
+pub mod frame;
 pub mod scene;
+pub mod settings;

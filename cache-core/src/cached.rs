@@ -1,0 +1,88 @@
+//! The first door: what every kind of record must be able to do.
+//!
+//! A room behind it says how its record is laid out, whether one is sound, how much it counts at a query and what it
+//! adds to the answer. Filing, clamping, merging and sealing are the same for all rooms and live outside.
+
+use glam::Vec3;
+
+use crate::id::RecordId;
+
+/// Where an answer is wanted: a point and its unit normal.
+#[derive(Clone, Copy, Debug)]
+pub struct Query {
+    /// World position.
+    pub position: Vec3,
+    /// Unit normal.
+    pub normal: Vec3,
+}
+
+/// What makes a record unfit to be kept. Checked in one place, [`Cached::decode`], whoever sent the bytes.
+#[derive(Clone, Copy, PartialEq, Debug, thiserror::Error)]
+pub enum Invalid {
+    /// Not a whole number of records.
+    #[error("a record of this kind has {expected} bytes, got {got}")]
+    Length {
+        /// Bytes of one record.
+        expected: usize,
+        /// Bytes there were.
+        got: usize,
+    },
+    /// A field that is NaN or infinite.
+    #[error("{field} is not a finite number")]
+    NotFinite {
+        /// Which.
+        field: &'static str,
+    },
+    /// A normal that is not of unit length.
+    #[error("normal has length {length}, expected 1")]
+    Normal {
+        /// Its length.
+        length: f32,
+    },
+    /// A field outside its range.
+    #[error("{field} is {value}, expected {expected}")]
+    Range {
+        /// Which.
+        field: &'static str,
+        /// What it was.
+        value: f32,
+        /// What would have been right.
+        expected: &'static str,
+    },
+}
+
+/// A kind of record. Records are immutable: what changes later (the clamped R, a) is derived and kept outside.
+pub trait Cached: Clone + Send + Sync + 'static {
+    /// Number of the kind on the wire; never re-used.
+    const KIND: u32;
+    /// Bytes of one packed record.
+    const BYTES: usize;
+    /// What a query gets.
+    type Answer: Clone + Default;
+
+    /// Identity.
+    fn id(&self) -> RecordId;
+    /// The site's position.
+    fn position(&self) -> Vec3;
+    /// R_i at birth: distance to the surroundings, world length, before any clamping. Positive, may be infinite.
+    fn radius(&self) -> f32;
+    /// Least and greatest R the record may count with, world lengths; both finite and positive.
+    fn radius_bounds(&self) -> (f32, f32);
+
+    /// Weight at a query for the clamped and bounded `radius` and the allowed error `a`; at most 0: does not count.
+    /// Must be 0 or less wherever `query` is farther than `a * radius` from the site.
+    fn weight(&self, query: &Query, radius: f32, a: f32) -> f32;
+    /// Adds this record's estimate at `query`, times `weight`, to `answer`. `limit` in [0, 1] scales gradients where
+    /// the record counts farther than its R allows extrapolation.
+    fn add(&self, query: &Query, weight: f32, limit: f32, answer: &mut Self::Answer);
+    /// Divides the sum by the weights.
+    fn finish(answer: &mut Self::Answer, weights: f32);
+
+    /// Appends the record's [`Self::BYTES`] bytes.
+    fn encode(&self, bytes: &mut Vec<u8>);
+    /// Reads and checks one record: the only way bytes become one.
+    ///
+    /// # Errors
+    /// What is unsound about it.
+    fn decode(bytes: &[u8]) -> Result<Self, Invalid>;
+}

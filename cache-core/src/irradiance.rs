@@ -1,0 +1,301 @@
+//! The room of irradiance: diffuse indirect light, interpolated along its gradients.
+//!
+//! Papers: Ward, Rubinstein, Clear 1988 (weights, in-front test); Ward, Heckbert 1992 (gradients); Krivanek et al. 2006
+//! and the 2007 course (weight that falls to 0, R bounded by projected pixel size, gradient limit).
+//!
+//! A record holds E_i [W/m²], its translational gradient [W/m³] and rotational gradient [W/m² per radian], each per
+//! colour channel and along the tangents of `Frame::around(n_i)`.
+//!
+//! Fails where irradiance varies faster than R lets on: small bright sources the gather missed (neighbor clamping
+//! mends most), and curved surfaces whose curvature exceeds what `sqrt(1 - n·n_i)` assumes.
+
+use glam::{Vec2, Vec3};
+
+use crate::cached::{Cached, Invalid, Query};
+use crate::id::RecordId;
+use crate::math::{Frame, Rgb};
+
+/// A record of irradiance.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Irradiance {
+    /// Identity.
+    pub id: RecordId,
+    /// Site p_i, world.
+    pub position: Vec3,
+    /// Unit normal n_i.
+    pub normal: Vec3,
+    /// R_i at birth: harmonic mean of the distances the gather met, limited by |E| / |∇_t E|; world length.
+    pub radius: f32,
+    /// Least R the record counts with (from the projected pixel size), world length.
+    pub radius_min: f32,
+    /// Greatest R the record counts with, world length.
+    pub radius_max: f32,
+    /// E_i, W/m².
+    pub irradiance: Rgb,
+    /// ∇_t E_i, W/m³, per channel, along the site's tangents.
+    pub gradient_t: [Vec2; 3],
+    /// ∇_r E_i, W/m² per radian, per channel: change when the normal turns about the site's tangents.
+    pub gradient_r: [Vec2; 3],
+}
+
+/// What a query of irradiance gets.
+#[derive(Clone, Copy, PartialEq, Default, Debug)]
+pub struct Answer {
+    /// Irradiance, W/m².
+    pub irradiance: Rgb,
+    /// How many records answered.
+    pub records: u32,
+}
+
+/// Wire and memory order of the float fields after the id.
+const FLOATS: usize = 24;
+
+/// Weights are kept below this, so that a query on the site itself stays finite.
+const ERROR_MIN: f32 = 1e-4;
+
+impl Cached for Irradiance {
+    const KIND: u32 = 1;
+    const BYTES: usize = 16 + 4 * FLOATS;
+    type Answer = Answer;
+
+    fn id(&self) -> RecordId {
+        self.id
+    }
+
+    fn position(&self) -> Vec3 {
+        self.position
+    }
+
+    fn radius(&self) -> f32 {
+        self.radius
+    }
+
+    fn radius_bounds(&self) -> (f32, f32) {
+        (self.radius_min, self.radius_max)
+    }
+
+    /// Ward 1988 eq. 5, lowered by 1/a so that it reaches 0 at the border (course slides, "weighting function revisited").
+    /// A record in front of the query (Ward 1988 eq. 6) does not count; the test's tolerance scales with R.
+    #[inline]
+    fn weight(&self, query: &Query, radius: f32, a: f32) -> f32 {
+        let offset = query.position - self.position;
+        let translation = offset.length() / radius;
+        // sqrt(1 - n·n_i) without its cancellation: |n - n_i|² = 2 (1 - n·n_i) for unit vectors.
+        let rotation = (query.normal - self.normal).length() * std::f32::consts::FRAC_1_SQRT_2;
+        let error = translation + rotation;
+        if error >= a {
+            return 0.0;
+        }
+        let behind = offset.dot(query.normal + self.normal) * 0.5;
+        if behind < -IN_FRONT_TOLERANCE * radius {
+            return 0.0;
+        }
+        1.0 / error.max(ERROR_MIN) - 1.0 / a
+    }
+
+    /// Ward 1992 eq. 6: E_i + (n_i × n)·∇_r E_i + (p - p_i)·∇_t E_i, never below 0.
+    #[inline]
+    fn add(&self, query: &Query, weight: f32, limit: f32, answer: &mut Answer) {
+        let frame = Frame::around(self.normal);
+        let shift = frame.tangential(query.position - self.position) * limit;
+        let turn = frame.tangential(self.normal.cross(query.normal));
+        let change = |c: usize| self.gradient_t[c].dot(shift) + self.gradient_r[c].dot(turn);
+        let estimate = self.irradiance + Vec3::new(change(0), change(1), change(2));
+        answer.irradiance += estimate.max(Vec3::ZERO) * weight;
+        answer.records += 1;
+    }
+
+    fn finish(answer: &mut Answer, weights: f32) {
+        answer.irradiance /= weights;
+    }
+
+    fn encode(&self, bytes: &mut Vec<u8>) {
+        bytes.extend_from_slice(&self.id.0.to_le_bytes());
+        for value in self.floats() {
+            bytes.extend_from_slice(&value.to_le_bytes());
+        }
+    }
+
+    fn decode(bytes: &[u8]) -> Result<Self, Invalid> {
+        if bytes.len() != Self::BYTES {
+            return Err(Invalid::Length { expected: Self::BYTES, got: bytes.len() });
+        }
+        let (head, tail) = bytes.split_at(16);
+        let id = RecordId(head.iter().rev().fold(0, |id, &b| id << 8 | u128::from(b)));
+        let mut f = [0f32; FLOATS];
+        for (value, four) in f.iter_mut().zip(tail.chunks_exact(4)) {
+            *value = f32::from_le_bytes([four[0], four[1], four[2], four[3]]);
+        }
+        let pairs = |at: usize| [0, 2, 4].map(|i| Vec2::new(f[at + i], f[at + i + 1]));
+        let record = Self {
+            id,
+            position: Vec3::new(f[0], f[1], f[2]),
+            normal: Vec3::new(f[3], f[4], f[5]),
+            radius: f[6],
+            radius_min: f[7],
+            radius_max: f[8],
+            irradiance: Vec3::new(f[9], f[10], f[11]),
+            gradient_t: pairs(12),
+            gradient_r: pairs(18),
+        };
+        record.check().map(|()| record)
+    }
+}
+
+/// No scene is larger: squares of such lengths still fit a float, so nothing derived from a record overflows.
+const LENGTH_MAX: f32 = 1e18;
+
+/// How far, in R, a record may lie in front of a query and still count: enough for curved surfaces made of facets.
+const IN_FRONT_TOLERANCE: f32 = 0.01;
+
+impl Irradiance {
+    fn floats(&self) -> [f32; FLOATS] {
+        let [p, n, e] = [self.position, self.normal, self.irradiance];
+        let [t, r] = [self.gradient_t, self.gradient_r];
+        [
+            p.x,
+            p.y,
+            p.z,
+            n.x,
+            n.y,
+            n.z,
+            self.radius,
+            self.radius_min,
+            self.radius_max,
+            e.x,
+            e.y,
+            e.z,
+            t[0].x,
+            t[0].y,
+            t[1].x,
+            t[1].y,
+            t[2].x,
+            t[2].y,
+            r[0].x,
+            r[0].y,
+            r[1].x,
+            r[1].y,
+            r[2].x,
+            r[2].y,
+        ]
+    }
+
+    /// Whether the record is sound, whoever made it.
+    ///
+    /// # Errors
+    /// The first field that is not.
+    pub fn check(&self) -> Result<(), Invalid> {
+        const FIELDS: [(&str, usize); 8] = [
+            ("position", 3),
+            ("normal", 3),
+            ("radius", 1),
+            ("radius_min", 1),
+            ("radius_max", 1),
+            ("irradiance", 3),
+            ("gradient_t", 6),
+            ("gradient_r", 6),
+        ];
+        let floats = self.floats();
+        let mut values = floats.iter();
+        for (field, count) in FIELDS {
+            if values.by_ref().take(count).any(|v| !v.is_finite()) {
+                return Err(Invalid::NotFinite { field });
+            }
+        }
+        let length = self.normal.length();
+        if (length - 1.0).abs() > 1e-3 {
+            return Err(Invalid::Normal { length });
+        }
+        let positive = |field, value: f32| {
+            (value > 0.0).then_some(()).ok_or(Invalid::Range { field, value, expected: "more than 0" })
+        };
+        let reach = self.position.abs().max_element();
+        if reach > LENGTH_MAX {
+            return Err(Invalid::Range { field: "position", value: reach, expected: "at most 1e18" });
+        }
+        positive("radius", self.radius)?;
+        positive("radius_min", self.radius_min)?;
+        for (field, value) in [("radius", self.radius), ("radius_max", self.radius_max)] {
+            if value > LENGTH_MAX {
+                return Err(Invalid::Range { field, value, expected: "at most 1e18" });
+            }
+        }
+        if self.radius_max < self.radius_min {
+            let expected = "at least radius_min";
+            return Err(Invalid::Range { field: "radius_max", value: self.radius_max, expected });
+        }
+        if self.irradiance.min_element() < 0.0 {
+            let value = self.irradiance.min_element();
+            return Err(Invalid::Range { field: "irradiance", value, expected: "0 or more" });
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    pub(crate) fn sound() -> Irradiance {
+        Irradiance {
+            id: RecordId(0x0123_4567_89ab_cdef_0011_2233_4455_6677),
+            position: Vec3::new(1.0, 2.0, 3.0),
+            normal: Vec3::Y,
+            radius: 2.0,
+            radius_min: 0.1,
+            radius_max: 10.0,
+            irradiance: Vec3::new(1.0, 2.0, 3.0),
+            gradient_t: [Vec2::new(0.1, 0.2); 3],
+            gradient_r: [Vec2::new(0.3, -0.4); 3],
+        }
+    }
+
+    #[test]
+    fn encoding_is_stable_and_decodes_to_the_same() {
+        let mut bytes = Vec::new();
+        sound().encode(&mut bytes);
+        assert_eq!(bytes.len(), Irradiance::BYTES);
+        assert_eq!(bytes[..4], [0x77, 0x66, 0x55, 0x44]);
+        assert_eq!(bytes[16..20], 1f32.to_le_bytes());
+        assert_eq!(bytes[16 + 6 * 4..16 + 7 * 4], 2f32.to_le_bytes());
+        assert_eq!(Irradiance::decode(&bytes), Ok(sound()));
+        assert!(matches!(Irradiance::decode(&bytes[1..]), Err(Invalid::Length { .. })));
+    }
+
+    #[test]
+    fn unsound_records_are_refused_by_name() {
+        type Spoil = fn(&mut Irradiance);
+        let spoilt: [(&str, Spoil); 8] = [
+            ("position", |r| r.position.x = f32::NAN),
+            ("gradient_r", |r| r.gradient_r[2].y = f32::INFINITY),
+            ("radius", |r| r.radius = f32::INFINITY),
+            ("normal", |r| r.normal = Vec3::new(0.0, 2.0, 0.0)),
+            ("irradiance", |r| r.irradiance.y = -1e-6),
+            ("radius", |r| r.radius = 0.0),
+            ("radius_min", |r| r.radius_min = -1.0),
+            ("radius_max", |r| r.radius_max = 0.01),
+        ];
+        for (field, spoil) in spoilt {
+            let mut record = sound();
+            spoil(&mut record);
+            let mut bytes = Vec::new();
+            record.encode(&mut bytes);
+            let message = Irradiance::decode(&bytes).expect_err(field).to_string();
+            assert!(message.contains(field), "{field}: {message}");
+        }
+    }
+
+    #[test]
+    fn weight_falls_to_zero_at_the_border_and_excludes_what_lies_behind() {
+        let r = sound();
+        let at = |offset: Vec3| Query { position: r.position + offset, normal: r.normal };
+        assert!(r.weight(&at(Vec3::X * 0.5), 2.0, 0.3) > 0.0);
+        assert!(r.weight(&at(Vec3::X * 0.599), 2.0, 0.3) < 0.01);
+        assert_eq!(r.weight(&at(Vec3::X * 0.601), 2.0, 0.3), 0.0);
+        // A query below the record would see what the record does not.
+        assert_eq!(r.weight(&at(Vec3::new(0.1, -0.1, 0.0)), 2.0, 0.3), 0.0);
+        assert!(r.weight(&at(Vec3::new(0.1, 0.1, 0.0)), 2.0, 0.3) > 0.0);
+        // On the site itself the weight is finite.
+        assert!(r.weight(&at(Vec3::ZERO), 2.0, 0.3).is_finite());
+    }
+}

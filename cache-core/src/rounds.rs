@@ -1,0 +1,157 @@
+//! The plan by which a frame is filled: coarse to fine, level by level, independent of the farm.
+//!
+//! Every pixel has a rank in a 64 x 64 pattern (an ordered dither): pixels of low rank lie far apart, and any range of
+//! ranks is spread evenly. A round tests the candidates of a range of ranks against the cache as sealed before it. The
+//! ranges grow geometrically, so that each round adds a fixed fraction of the points tested before it: that keeps the
+//! candidates of one round apart and the records close in number to strictly sequential filling.
+//!
+//! The plan knows nothing of workers; what comes next depends only on how many records each step gathered.
+
+use std::ops::Range;
+
+/// Ranks in the pattern.
+pub const RANKS: u32 = 1 << (2 * RANK_BITS);
+const RANK_BITS: u32 = 6;
+
+/// Each round of the first pass ends at this many times the ranks tested before it.
+const GROWTH: f32 = 1.25;
+
+/// Rounds in each later pass, which only fills the holes that clamping tore.
+const LATER_ROUNDS: u32 = 8;
+
+/// Passes over a level before the plan gives up on its last holes; Krivanek 2006 needed at most 11.
+pub const PASSES_MAX: u32 = 12;
+
+/// Rank of a pixel: bits of x^y and y interleaved, finest differences first.
+pub fn rank(x: u32, y: u32) -> u32 {
+    (0..RANK_BITS).fold(0, |rank, bit| rank << 2 | ((x ^ y) >> bit & 1) << 1 | y >> bit & 1)
+}
+
+/// One step of a frame.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub enum Step {
+    /// A round: test the candidates of these ranks, gather where the sealed cache does not cover.
+    Fill {
+        /// Level being filled, counted from the camera: 1, 2, ...
+        level: u32,
+        /// Pass over the level, from 0.
+        pass: u32,
+        /// Ranks whose candidates are tested.
+        ranks: Range<u32>,
+    },
+    /// Interpolate every sample of every pixel from the sealed cache.
+    Pixels,
+}
+
+/// Gives a frame's steps one after another: levels deepest first, each in passes until one gathers nothing, then the
+/// pixels.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    level: u32,
+    pass: u32,
+    from: u32,
+    gathered: u64,
+    done: bool,
+}
+
+impl Plan {
+    /// A plan for `levels` levels of records (0: pixels only).
+    pub fn new(levels: u32) -> Self {
+        Self { level: levels, pass: 0, from: 0, gathered: 0, done: false }
+    }
+
+    /// The next step, told how many records the previous one gathered (0 before the first); `None` when all is done.
+    pub fn next(&mut self, gathered: u64) -> Option<Step> {
+        self.gathered += gathered;
+        if self.level > 0 && self.from == RANKS {
+            self.from = 0;
+            self.pass += 1;
+            if self.gathered == 0 || self.pass == PASSES_MAX {
+                self.pass = 0;
+                self.level -= 1;
+            }
+            self.gathered = 0;
+        }
+        if self.level > 0 {
+            let from = self.from;
+            self.from = self.round_end();
+            return Some(Step::Fill { level: self.level, pass: self.pass, ranks: from..self.from });
+        }
+        (!std::mem::replace(&mut self.done, true)).then_some(Step::Pixels)
+    }
+
+    fn round_end(&self) -> u32 {
+        let end = match self.pass {
+            0 => ((self.from as f32 * GROWTH) as u32).max(self.from + 1),
+            _ => self.from + RANKS / LATER_ROUNDS,
+        };
+        end.min(RANKS)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_rank_stands_once_in_the_pattern_and_low_ranks_lie_apart() {
+        let mut seen = vec![false; RANKS as usize];
+        for y in 0..64 {
+            for x in 0..64 {
+                assert!(!std::mem::replace(&mut seen[rank(x, y) as usize], true));
+            }
+        }
+        // The first 4^k ranks form a grid of spacing 64 / 2^k.
+        for y in 0..64 {
+            for x in 0..64 {
+                assert_eq!(rank(x, y) < 16, x % 16 == 0 && y % 16 == 0);
+            }
+        }
+    }
+
+    fn steps(levels: u32, mut gathered: impl FnMut(&Step) -> u64) -> Vec<Step> {
+        let mut plan = Plan::new(levels);
+        let (mut all, mut last) = (Vec::new(), 0);
+        while let Some(step) = plan.next(last) {
+            last = gathered(&step);
+            all.push(step);
+        }
+        all
+    }
+
+    #[test]
+    fn each_pass_tests_every_rank_once_deepest_level_first() {
+        let all = steps(2, |step| match step {
+            Step::Fill { pass: 0, .. } => 1,
+            _ => 0,
+        });
+        assert_eq!(all.last(), Some(&Step::Pixels));
+        let mut expected = vec![];
+        for level in [2, 1] {
+            for pass in [0, 1] {
+                let mut at = 0;
+                for step in &all {
+                    if let Step::Fill { level: l, pass: p, ranks } = step
+                        && (*l, *p) == (level, pass)
+                    {
+                        assert_eq!(ranks.start, at);
+                        assert!(ranks.end > ranks.start);
+                        at = ranks.end;
+                        expected.push(step.clone());
+                    }
+                }
+                assert_eq!(at, RANKS);
+            }
+        }
+        assert_eq!(all[..all.len() - 1], expected);
+    }
+
+    #[test]
+    fn a_level_ends_with_the_first_pass_that_gathers_nothing_or_gives_up() {
+        assert_eq!(steps(0, |_| 0), [Step::Pixels]);
+        let passes =
+            |all: &[Step]| all.iter().filter(|s| matches!(s, Step::Fill { ranks, .. } if ranks.start == 0)).count();
+        assert_eq!(passes(&steps(1, |_| 0)), 1);
+        assert_eq!(passes(&steps(1, |_| 1)), PASSES_MAX as usize);
+    }
+}

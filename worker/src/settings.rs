@@ -1,0 +1,99 @@
+//! What a picture depends on besides the scene: the settings users choose, and the namespace they lead to.
+
+use cache_core::Namespace;
+
+use crate::scene::Camera;
+
+/// How indirect light is computed.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Method {
+    /// Path tracing, no records: the unbiased reference.
+    Path,
+    /// Irradiance caching on diffuse reflection; glossy reflection is sampled per pixel.
+    Irradiance,
+}
+
+impl Method {
+    /// Every method, in the order to show them.
+    pub const ALL: [Method; 2] = [Method::Path, Method::Irradiance];
+
+    /// Its name on the command line and on the wire.
+    pub fn name(self) -> &'static str {
+        match self {
+            Method::Path => "path",
+            Method::Irradiance => "irradiance",
+        }
+    }
+
+    /// The method of a name.
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|m| m.name() == name)
+    }
+}
+
+/// `bounces` for "until Russian roulette ends the path".
+pub const ALL_BOUNCES: u32 = u32::MAX;
+
+/// Everything about a picture but its scene.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Settings {
+    /// View; its aspect is already that of the picture.
+    pub camera: Camera,
+    /// Pixels in a row, 1 to 65536.
+    pub width: u32,
+    /// Rows, 1 to 65536.
+    pub height: u32,
+    /// Samples a pixel, 1 to 65536.
+    pub spp: u32,
+    /// How indirect light is computed.
+    pub method: Method,
+    /// Allowed interpolation error a (Ward 1988), more than 0 and at most 10.
+    pub a: f32,
+    /// Rays in one gather, 4 to 1048576.
+    pub rays: u32,
+    /// Indirect bounces, or [`ALL_BOUNCES`].
+    pub bounces: u32,
+    /// Turns to another, equally good, set of random numbers.
+    pub seed: u64,
+}
+
+/// Edge of a tile in pixels.
+pub const TILE: u32 = 16;
+
+/// Levels of records worth filling when every bounce is asked for; deeper light continues as paths.
+const LEVELS_MAX: u32 = 2;
+
+impl Settings {
+    /// Levels of records the method fills; 0 for methods without.
+    pub fn levels(&self) -> u32 {
+        match self.method {
+            Method::Path => 0,
+            Method::Irradiance => self.bounces.saturating_add(1).min(LEVELS_MAX),
+        }
+    }
+
+    /// Tiles of the picture, numbered row by row.
+    pub fn tiles(&self) -> u32 {
+        self.width.div_ceil(TILE) * self.height.div_ceil(TILE)
+    }
+
+    /// Pixels of a tile: x from, x to, y from, y to.
+    pub fn tile(&self, tile: u32) -> [u32; 4] {
+        let columns = self.width.div_ceil(TILE);
+        let (x, y) = (tile % columns * TILE, tile / columns * TILE);
+        [x, (x + TILE).min(self.width), y, (y + TILE).min(self.height)]
+    }
+
+    /// The namespace of the records: scene content and what changes a record's value. The camera, the size and `spp`
+    /// are not part of it: they decide which records are made, not what is in them.
+    pub fn namespace(&self, scene_hash: &[u8; 32]) -> Namespace {
+        let mut hasher = blake3::Hasher::new_derive_key("ambience namespace v1");
+        hasher.update(scene_hash);
+        hasher.update(self.method.name().as_bytes());
+        hasher.update(&self.a.to_le_bytes());
+        hasher.update(&self.rays.to_le_bytes());
+        hasher.update(&self.bounces.to_le_bytes());
+        hasher.update(&self.seed.to_le_bytes());
+        Namespace(*hasher.finalize().as_bytes())
+    }
+}
