@@ -1,0 +1,222 @@
+//! The connection to a server: addresses, channels, and which calls are worth repeating.
+
+use std::future::Future;
+use std::io;
+use std::path::PathBuf;
+use std::str::FromStr;
+use std::time::Duration;
+
+use cache_proto::v1;
+use hyper_util::rt::TokioIo;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::time::Instant;
+use tonic::transport::{Channel, Endpoint, Uri};
+use tonic::{Code, Response, Status};
+
+/// How long a server may be away before its clients give up.
+pub const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Longest message of the Frames service, bytes: the server leases at most 4 MiB of tiles at a time.
+pub const FRAMES_MESSAGE_MAX: usize = 8 << 20;
+
+/// Longest single attempt of a call. The longest the server takes its time for is `Lease`, 10 s.
+const ATTEMPT: Duration = Duration::from_secs(20);
+const CONNECT: Duration = Duration::from_secs(5);
+const KEEP_ALIVE: Duration = Duration::from_secs(10);
+const BACKOFF_FIRST: Duration = Duration::from_millis(50);
+const BACKOFF_MAX: Duration = Duration::from_secs(1);
+/// HTTP/2 windows, bytes; the default of 64 KiB would stop a batch of 448 KiB seven times.
+const STREAM_WINDOW: u32 = 4 << 20;
+const CONNECTION_WINDOW: u32 = 8 << 20;
+
+/// Where a server listens.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub enum Address {
+    /// `HOST:PORT`.
+    Tcp(String),
+    /// `unix:PATH`.
+    Unix(PathBuf),
+}
+
+impl FromStr for Address {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let wrong = || format!("{text:?} is no address; expected HOST:PORT or unix:PATH");
+        if let Some(path) = text.strip_prefix("unix:") {
+            return if path.is_empty() { Err(wrong()) } else { Ok(Self::Unix(path.into())) };
+        }
+        let (host, port) = text.rsplit_once(':').ok_or_else(wrong)?;
+        let sound = !host.is_empty() && port.parse::<u16>().is_ok_and(|p| p > 0);
+        let uri = format!("http://{text}").parse::<Uri>().is_ok_and(|u| u.path() == "/" && u.query().is_none());
+        if sound && uri { Ok(Self::Tcp(text.into())) } else { Err(wrong()) }
+    }
+}
+
+impl std::fmt::Display for Address {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Tcp(at) => f.write_str(at),
+            Self::Unix(path) => write!(f, "unix:{}", path.display()),
+        }
+    }
+}
+
+/// A channel to `address`. It connects with the first call and again whenever the connection was lost, so an absent
+/// server shows as `Unavailable` there, not here.
+pub fn connect(address: &Address) -> Channel {
+    match address.clone() {
+        Address::Tcp(at) => connect_with(move || {
+            let at = at.clone();
+            async move {
+                let stream = tokio::net::TcpStream::connect(at).await?;
+                stream.set_nodelay(true)?;
+                Ok(stream)
+            }
+        }),
+        #[cfg(unix)]
+        Address::Unix(path) => connect_with(move || tokio::net::UnixStream::connect(path.clone())),
+        #[cfg(not(unix))]
+        Address::Unix(_) => connect_with(|| async {
+            Err::<tokio::net::TcpStream, _>(io::Error::new(io::ErrorKind::Unsupported, "no Unix sockets here"))
+        }),
+    }
+}
+
+/// A channel whose bytes travel over whatever `open` opens: a socket, or a simulated one.
+pub fn connect_with<O, F, S>(open: O) -> Channel
+where
+    O: Fn() -> F + Send + 'static,
+    F: Future<Output = io::Result<S>> + Send + 'static,
+    S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+{
+    let connector = tower::service_fn(move |_: Uri| {
+        let opening = open();
+        async move { opening.await.map(TokioIo::new) }
+    });
+    // The name is only what the Host header says; `open` knows where to go.
+    Endpoint::from_static("http://ambience")
+        .connect_timeout(CONNECT)
+        .http2_keep_alive_interval(KEEP_ALIVE)
+        .keep_alive_timeout(KEEP_ALIVE)
+        .keep_alive_while_idle(true)
+        .initial_stream_window_size(STREAM_WINDOW)
+        .initial_connection_window_size(CONNECTION_WINDOW)
+        .connect_with_connector_lazy(connector)
+}
+
+/// Client of the Cache service.
+pub type Cache = v1::cache_client::CacheClient<Channel>;
+
+/// Client of the Frames service.
+pub type Frames = v1::frames_client::FramesClient<Channel>;
+
+/// Client of the Cache service over `channel`.
+pub fn cache(channel: Channel) -> Cache {
+    Cache::new(channel)
+}
+
+/// Client of the Frames service over `channel`, with room for many tiles in one message.
+pub fn frames(channel: Channel) -> Frames {
+    Frames::new(channel).max_decoding_message_size(FRAMES_MESSAGE_MAX).max_encoding_message_size(FRAMES_MESSAGE_MAX)
+}
+
+/// Whether an idempotent call that failed so may succeed when repeated. A cut stream comes as `Unknown`, a timeout of
+/// the transport as `Cancelled`.
+pub fn is_passing(status: &Status) -> bool {
+    matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled | Code::DeadlineExceeded)
+}
+
+/// Waiting times between attempts: doubling from 50 ms to 1 s.
+#[derive(Debug)]
+pub struct Backoff(Duration);
+
+impl Default for Backoff {
+    fn default() -> Self {
+        Self(BACKOFF_FIRST)
+    }
+}
+
+impl Backoff {
+    /// Waits, and longer the next time.
+    pub async fn wait(&mut self) {
+        tokio::time::sleep(self.0).await;
+        self.0 = (self.0 * 2).min(BACKOFF_MAX);
+    }
+}
+
+/// Makes an idempotent call until it is answered, at most until [`PATIENCE`] has passed since it first failed.
+///
+/// # Errors
+/// The last failure: one that repeating does not mend, or one that lasted too long ([`is_passing`] tells which).
+pub async fn retry<T, F, R>(call: F) -> Result<T, Status>
+where
+    F: FnMut() -> R,
+    R: Future<Output = Result<Response<T>, Status>>,
+{
+    retry_for(PATIENCE, call).await
+}
+
+/// As [`retry`], with another patience.
+///
+/// # Errors
+/// As [`retry`].
+pub async fn retry_for<T, F, R>(patience: Duration, mut call: F) -> Result<T, Status>
+where
+    F: FnMut() -> R,
+    R: Future<Output = Result<Response<T>, Status>>,
+{
+    let (mut backoff, mut failing) = (Backoff::default(), None);
+    loop {
+        let answer = tokio::time::timeout(ATTEMPT, call()).await;
+        let status = match answer {
+            Ok(Ok(response)) => return Ok(response.into_inner()),
+            Ok(Err(status)) if !is_passing(&status) => return Err(status),
+            Ok(Err(status)) => status,
+            Err(_) => Status::deadline_exceeded(format!("no answer within {} s", ATTEMPT.as_secs())),
+        };
+        let since = *failing.get_or_insert_with(Instant::now);
+        if since.elapsed() >= patience {
+            return Err(status);
+        }
+        backoff.wait().await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+
+    use super::*;
+
+    #[test]
+    fn addresses_are_read_and_shown() {
+        for sound in ["127.0.0.1:4670", "render-7.farm:80", "[::1]:4670", "unix:/tmp/a b", "unix:socket"] {
+            assert_eq!(sound.parse::<Address>().expect(sound).to_string(), sound);
+        }
+        for wrong in ["", "host", "host:", ":80", "host:0", "host:70000", "unix:", "http://host:80", "a b:80"] {
+            assert!(wrong.parse::<Address>().expect_err(wrong).contains("HOST:PORT or unix:PATH"));
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn what_passes_is_repeated_and_what_does_not_is_not() {
+        let calls = Cell::new(0);
+        let after = |failures: u32, status: Status| {
+            calls.set(0);
+            let calls = &calls;
+            retry(move || {
+                calls.set(calls.get() + 1);
+                let answer = if calls.get() > failures { Ok(Response::new(calls.get())) } else { Err(status.clone()) };
+                async move { answer }
+            })
+        };
+        assert_eq!(after(4, Status::unavailable("away")).await.expect("mended"), 5);
+        assert_eq!(after(4, Status::unknown("cut")).await.expect("mended"), 5);
+        assert!(after(4, Status::invalid_argument("wrong")).await.is_err());
+        assert_eq!(calls.get(), 1);
+        let began = Instant::now();
+        assert_eq!(after(u32::MAX, Status::unavailable("away")).await.expect_err("gone").message(), "away");
+        assert!((30..33).contains(&began.elapsed().as_secs()));
+    }
+}

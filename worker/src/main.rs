@@ -1,0 +1,26 @@
+//! The worker as a program of its own: `worker --server ADDR [--threads N]`.
+
+use std::process::ExitCode;
+
+use clap::Parser;
+use worker::farm::{self, WorkerArgs};
+
+/// Renders for a server of Ambience until it is told to stop.
+#[derive(Parser)]
+#[command(version)]
+struct Args {
+    #[command(flatten)]
+    worker: WorkerArgs,
+}
+
+fn main() -> ExitCode {
+    let args = Args::parse();
+    farm::log_to_stderr();
+    match farm::block_on(args.worker) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) => {
+            eprintln!("worker: {e:#}");
+            ExitCode::FAILURE
+        }
+    }
+}

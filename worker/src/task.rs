@@ -1,0 +1,119 @@
+//! The CPU work of one lease, and the numbers told about it.
+
+use std::ops::Range;
+
+use cache_core::Irradiance;
+use cache_core::rounds::Step;
+use cache_proto::{convert, v1};
+
+use crate::frame::{Counts, Frame, Levels};
+
+/// What came of a lease.
+#[derive(Default)]
+pub struct Done {
+    /// New records with their level.
+    pub records: Vec<(u32, Irradiance)>,
+    /// Finished tiles.
+    pub tiles: Vec<v1::FrameTile>,
+    counts: Counts,
+    cpu_seconds: f64,
+}
+
+/// Does the tiles of a step. `None` when `dropped` said, between two tiles, that nobody waits for them.
+pub fn run(
+    frame: &Frame,
+    levels: &Levels,
+    step: &v1::Step,
+    tiles: Range<u32>,
+    dropped: impl Fn() -> bool,
+    clock: CpuClock,
+) -> Option<Done> {
+    let mut done = Done::default();
+    // The server counts tiles as we do; a range past the end would make tiles nobody can place.
+    for tile in tiles.start..tiles.end.min(frame.settings().tiles()) {
+        if dropped() {
+            return None;
+        }
+        let counts = match convert::plan_step(step) {
+            Step::Fill { level, ranks, .. } => {
+                let (records, counts) = frame.fill(level, ranks, tile, levels);
+                done.records.extend(records.into_iter().map(|r| (level, r)));
+                counts
+            }
+            Step::Pixels => {
+                let (pixels, counts) = frame.pixels(tile, levels);
+                done.tiles.push(v1::FrameTile { tile, pixels: packed(&pixels).into() });
+                counts
+            }
+        };
+        done.add(&counts);
+    }
+    done.cpu_seconds = clock.seconds();
+    Some(done)
+}
+
+impl Done {
+    fn add(&mut self, counts: &Counts) {
+        self.counts.gather_rays += counts.gather_rays;
+        self.counts.pixel_rays += counts.pixel_rays;
+        self.counts.shadow_rays += counts.shadow_rays;
+        self.counts.queries += counts.queries;
+        self.counts.misses += counts.misses;
+    }
+
+    /// The counts of `Complete`: `cpu_seconds.PHASE` and `records.PHASE` (PHASE is `level N` or `pixels`),
+    /// `rays.gather`, `rays.pixel`, `rays.shadow`, `queries`, `misses`, and of bytes on the wire `bytes.inserted` and
+    /// `bytes.subscribed` (packed records), `bytes.tiles` (packed pixels).
+    pub fn counts(&self, step: &v1::Step, inserted: u64, subscribed: u64) -> Vec<v1::Count> {
+        let phase = match step.level {
+            0 => "pixels".to_string(),
+            level => format!("level {level}"),
+        };
+        let tiles: usize = self.tiles.iter().map(|t| t.pixels.len()).sum();
+        let all = [
+            (format!("cpu_seconds.{phase}"), self.cpu_seconds),
+            (format!("records.{phase}"), self.records.len() as f64),
+            ("rays.gather".into(), self.counts.gather_rays as f64),
+            ("rays.pixel".into(), self.counts.pixel_rays as f64),
+            ("rays.shadow".into(), self.counts.shadow_rays as f64),
+            ("queries".into(), self.counts.queries as f64),
+            ("misses".into(), self.counts.misses as f64),
+            ("bytes.inserted".into(), inserted as f64),
+            ("bytes.subscribed".into(), subscribed as f64),
+            ("bytes.tiles".into(), tiles as f64),
+        ];
+        all.into_iter().filter(|(_, value)| *value != 0.0).map(|(name, value)| v1::Count { name, value }).collect()
+    }
+}
+
+/// Little endian float32.
+fn packed(values: &[f32]) -> Vec<u8> {
+    values.iter().flat_map(|v| v.to_le_bytes()).collect()
+}
+
+/// CPU time of the thread it was started on.
+pub struct CpuClock(f64);
+
+impl CpuClock {
+    /// Starts counting.
+    pub fn start() -> Self {
+        Self(thread_seconds())
+    }
+
+    /// CPU seconds since the start; ask on the same thread.
+    pub fn seconds(&self) -> f64 {
+        thread_seconds() - self.0
+    }
+}
+
+#[cfg(any(target_os = "linux", target_os = "macos", target_os = "freebsd"))]
+fn thread_seconds() -> f64 {
+    let now = nix::time::clock_gettime(nix::time::ClockId::CLOCK_THREAD_CPUTIME_ID);
+    now.map_or(0.0, |t| std::time::Duration::from(t).as_secs_f64())
+}
+
+/// Without such a clock the statistics show 0.
+#[cfg(not(any(target_os = "linux", target_os = "macos", target_os = "freebsd")))]
+fn thread_seconds() -> f64 {
+    0.0
+}
