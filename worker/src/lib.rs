@@ -1,5 +1,33 @@
 //! How light becomes records and records become pixels.
+//!
+//! In the order of the flow, one sentence each:
+//!
+//! - [`scene`]: plain data from glTF and Radiance files.
+//! - [`settings`]: what a picture depends on besides its scene.
+//! - [`bvh`]: rays against triangles.
+//! - [`world`]: what a ray meets, and from where the next may start.
+//! - [`bsdf`]: how light scatters at a surface.
+//! - [`lights`]: where light comes from and how shadow rays find it.
+//! - [`sampler`]: where a path's random numbers come from.
+//! - [`trace`]: what a ray sees where it lands: the second door, and the path tracer.
+//! - [`gather`]: a record of irradiance is made.
+//! - [`frame`]: the two kinds of work a worker leases: filling rounds and making pixels.
+//! - [`math`]: functions whose bits are the same everywhere.
 
-pub mod frame;
 pub mod scene;
 pub mod settings;
+
+pub mod bvh;
+pub mod world;
+
+pub mod bsdf;
+pub mod lights;
+
+pub mod sampler;
+pub mod trace;
+
+pub mod gather;
+
+pub mod frame;
+
+pub mod math;
