@@ -29,11 +29,17 @@ use primitive::{Meshes, Target};
 /// What is wrong and where in the file; `load` puts the file's name in front.
 type Fault = String;
 
+/// Longest message, in characters.
+const LONGEST_LINE: usize = 2000;
+
 /// Reads the default scene (the first where the file names none). The hash is left to the caller.
 pub(super) fn load(path: &Path) -> Result<Scene, SceneError> {
     let name = path.display();
-    // One line, whatever a file has in its names.
-    let line = |text: Fault| format!("{name}: {text}").replace(|c: char| c.is_control(), " ");
+    // One line of bearable length, whatever a file has in its names and URIs.
+    let line = |text: Fault| -> String {
+        let text = format!("{name}: {text}").replace(|c: char| c.is_control(), " ");
+        text.chars().take(LONGEST_LINE).collect()
+    };
     let document = Document::open(path).map_err(|fault| SceneError(line(fault)))?;
     let mut scene = read(&document).map_err(|fault| SceneError(line(fault)))?;
     scene.warnings = scene.warnings.into_iter().map(line).collect();
