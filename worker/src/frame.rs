@@ -19,6 +19,9 @@ use crate::world::World;
 /// Floats a pixel in a finished tile: beauty, direct, indirect, irradiance (RGB each), and how many records answered.
 pub const CHANNELS: usize = 13;
 
+/// Levels of records worth filling; deeper light continues as paths.
+const LEVELS_MAX: u32 = 2;
+
 /// Reach a record has at least, in pixels as projected at its site: level 1, and deeper levels.
 const REACH_MIN_PIXELS: [f32; 2] = [2.0, 6.0];
 
@@ -73,6 +76,15 @@ impl Frame {
     /// Where its records belong.
     pub fn namespace(&self) -> &Namespace {
         &self.namespace
+    }
+
+    /// Levels of records worth filling: one for each bounce and one for gathered light, as far as the method goes.
+    pub fn levels(&self) -> u32 {
+        let s = &self.settings;
+        match s.method {
+            Method::Path => 0,
+            Method::Irradiance => s.bounces.saturating_add(self.lights.any_gathered().into()).min(LEVELS_MAX),
+        }
     }
 
     /// Tests the candidates of `tile` whose ranks lie in `ranks` and gathers a record of `level` where the sealed

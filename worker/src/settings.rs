@@ -61,18 +61,7 @@ pub struct Settings {
 /// Edge of a tile in pixels.
 pub const TILE: u32 = 16;
 
-/// Levels of records worth filling when every bounce is asked for; deeper light continues as paths.
-const LEVELS_MAX: u32 = 2;
-
 impl Settings {
-    /// Levels of records the method fills; 0 for methods without.
-    pub fn levels(&self) -> u32 {
-        match self.method {
-            Method::Path => 0,
-            Method::Irradiance => self.bounces.saturating_add(1).min(LEVELS_MAX),
-        }
-    }
-
     /// Tiles of the picture, numbered row by row.
     pub fn tiles(&self) -> u32 {
         self.width.div_ceil(TILE) * self.height.div_ceil(TILE)
