@@ -1,6 +1,9 @@
+use cache_core::{
+    Sealed,
+    rounds::{Plan, Step},
+};
 use std::sync::Arc;
-use cache_core::{Sealed, rounds::{Plan, Step}};
-use worker::{frame::*, settings::*, scene};
+use worker::{frame::*, scene, settings::*};
 fn main() {
     let a: Vec<String> = std::env::args().collect();
     let scene = scene::load(std::path::Path::new(&a[1])).unwrap();
@@ -22,7 +25,20 @@ fn main() {
     let run = |f: &(dyn Fn(u32) -> (Vec<f32>, Vec<cache_core::Irradiance>, Counts) + Sync)| {
         let next = std::sync::atomic::AtomicU32::new(0);
         let mut out: Vec<_> = std::thread::scope(|s| {
-            let hs: Vec<_> = (0..2).map(|_| s.spawn(|| { let mut v = vec![]; loop { let t = next.fetch_add(1, std::sync::atomic::Ordering::Relaxed); if t >= tiles { return v; } v.push((t, f(t))); } })).collect();
+            let hs: Vec<_> = (0..2)
+                .map(|_| {
+                    s.spawn(|| {
+                        let mut v = vec![];
+                        loop {
+                            let t = next.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+                            if t >= tiles {
+                                return v;
+                            }
+                            v.push((t, f(t)));
+                        }
+                    })
+                })
+                .collect();
             hs.into_iter().flat_map(|h| h.join().unwrap()).collect()
         });
         out.sort_by_key(|o| o.0);
@@ -32,20 +48,37 @@ fn main() {
         match step {
             Step::Fill { level, pass, ranks } => {
                 rounds += 1;
-                let out = run(&|t| { let (r, c) = frame.fill(level, ranks.clone(), t, &levels); (vec![], r, c) });
+                let out = run(&|t| {
+                    let (r, c) = frame.fill(level, ranks.clone(), t, &levels);
+                    (vec![], r, c)
+                });
                 let new: Vec<_> = out.into_iter().flat_map(|o| o.1.1).collect();
                 last = new.len() as u64;
                 Arc::make_mut(&mut levels[level as usize - 1]).extend(new);
-                if ranks.end == 4096 { eprintln!("level {level} pass {pass} round {rounds}: {} records {:.1}s", levels[level as usize - 1].len(), t0.elapsed().as_secs_f32()); }
+                if ranks.end == 4096 {
+                    eprintln!(
+                        "level {level} pass {pass} round {rounds}: {} records {:.1}s",
+                        levels[level as usize - 1].len(),
+                        t0.elapsed().as_secs_f32()
+                    );
+                }
             }
             Step::Pixels => {
-                let out = run(&|t| { let (p, c) = frame.pixels(t, &levels); (p, vec![], c) });
+                let out = run(&|t| {
+                    let (p, c) = frame.pixels(t, &levels);
+                    (p, vec![], c)
+                });
                 let mut img = vec![0f32; (size * size * 3) as usize];
                 let (mut q, mut m, mut pr, mut sr) = (0, 0, 0, 0);
                 for (t, (p, _, c)) in out {
-                    q += c.queries; m += c.misses; pr += c.path_rays; sr += c.shadow_rays;
+                    q += c.queries;
+                    m += c.misses;
+                    pr += c.path_rays;
+                    sr += c.shadow_rays;
                     for (i, [x, y]) in settings.pixels(t).enumerate() {
-                        for k in 0..3 { img[((y * size + x) * 3 + k) as usize] = p[i * CHANNELS + k as usize]; }
+                        for k in 0..3 {
+                            img[((y * size + x) * 3 + k) as usize] = p[i * CHANNELS + k as usize];
+                        }
                     }
                 }
                 eprintln!("pixels {:.1}s queries {q} misses {m} rays {pr} shadow {sr}", t0.elapsed().as_secs_f32());

@@ -31,6 +31,9 @@ const REACH_RATIO: f32 = 32.0;
 /// Rays of a deeper level's gather, as a fraction: its error is averaged over many rays of the level above.
 const DEEPER_RAYS: f32 = 0.25;
 
+/// Rays gathered for a sample of a pixel that no record covers, as a fraction: its pixel's other samples share the error.
+const MISSED_RAYS: f32 = 0.0625;
+
 /// The sealed records of every level; `[0]` is level 1. Cheap to clone.
 pub type Levels = Vec<Arc<Sealed<Irradiance>>>;
 
@@ -53,8 +56,8 @@ pub struct Frame {
     lights: Lights,
     settings: Settings,
     namespace: Namespace,
-    /// Cells of a gather at level 1, and at deeper ones.
-    strata: [Strata; 2],
+    /// Cells of a gather at level 1, at deeper ones, and for a sample of a pixel that no record covers.
+    strata: [Strata; 3],
 }
 
 impl Frame {
@@ -63,8 +66,7 @@ impl Frame {
         let namespace = settings.namespace(&scene.hash);
         let world = World::new(scene);
         let lights = Lights::new(&world, settings.method != Method::Path);
-        let deeper = (settings.rays as f32 * DEEPER_RAYS) as u32;
-        let strata = [Strata::new(settings.rays), Strata::new(deeper)];
+        let strata = [1.0, DEEPER_RAYS, MISSED_RAYS].map(|f| Strata::new((settings.rays as f32 * f) as u32));
         Self { world, lights, settings, namespace, strata }
     }
 
@@ -122,7 +124,8 @@ impl Frame {
 
     fn tracer<'a>(&'a self, levels: &'a Levels) -> Tracer<'a> {
         let cached = self.settings.method != Method::Path;
-        Tracer { world: &self.world, lights: &self.lights, levels, bounces: self.settings.bounces, cached }
+        let bounces = self.settings.bounces;
+        Tracer { world: &self.world, lights: &self.lights, levels, bounces, cached, regather: None }
     }
 
     /// The candidate of a pixel: the diffuse surface where a path from its middle has its `level`th meeting.
@@ -156,7 +159,7 @@ impl Frame {
     /// The finished pixels of `tile`, row by row, [`CHANNELS`] floats each.
     pub fn pixels(&self, tile: u32, sealed: &Levels) -> (Vec<f32>, Counts) {
         let mut counts = Counts::default();
-        let tracer = self.tracer(sealed);
+        let tracer = Tracer { regather: Some(&self.strata[2]), ..self.tracer(sealed) };
         let mut pixels = Vec::new();
         for [x, y] in self.settings.pixels(tile) {
             let seed =

@@ -1,14 +1,14 @@
 //! A record of irradiance is made: stratified rays from a site, each bringing back what it sees where it lands.
 
-use cache_core::hemisphere::{Sample, Strata};
+use cache_core::hemisphere::Strata;
 use cache_core::id::{Origin, Random};
 use cache_core::math::Frame;
 use cache_core::{Cached, Irradiance, Namespace};
-use glam::{Vec2, Vec3};
+use glam::Vec2;
 
 use crate::frame::Counts;
 use crate::sampler::Sampler;
-use crate::trace::{Chance, Tracer};
+use crate::trace::Tracer;
 use crate::world::Meeting;
 
 /// Where a record is wanted.
@@ -53,12 +53,7 @@ impl Gather<'_> {
         // A turn of the strata about the normal, so that neighbouring records do not err alike.
         let frame = turned(site.at.frame, random.next());
         let mut sampler = Sampler::Stream(random);
-        let samples: Vec<_> = (0..self.strata.rays())
-            .map(|cell| {
-                let [u, v, ..] = sampler.next4();
-                self.sample(site, frame.to_world(self.strata.direction(cell, Vec2::new(u, v))), &mut sampler, counts)
-            })
-            .collect();
+        let samples = self.tracer.hemisphere(&site.at, frame, self.level, self.strata, &mut sampler, counts);
         let estimate = self.strata.estimate(&samples);
         let own = |v: Vec2| site.at.frame.tangential(frame.x * v.x + frame.y * v.y);
         Irradiance {
@@ -72,17 +67,6 @@ impl Gather<'_> {
             gradient_t: estimate.gradient_t.map(own),
             gradient_r: estimate.gradient_r.map(own),
         }
-    }
-
-    fn sample(&self, site: &Site, direction: Vec3, sampler: &mut Sampler, counts: &mut Counts) -> Sample {
-        let direction = direction.normalize();
-        if direction.dot(site.at.facet) <= 0.0 {
-            // Below the facet of a smooth surface: the surface hides itself, at no distance worth counting.
-            return Sample { radiance: Vec3::ZERO, distance: f32::INFINITY };
-        }
-        let ray = (site.at.leave(direction), direction);
-        let seen = self.tracer.see(ray, self.level + 1, Chance::Gathered, sampler, counts);
-        Sample { radiance: seen.total().max(Vec3::ZERO), distance: seen.distance }
     }
 }
 

@@ -8,6 +8,7 @@
 //! - [`world`]: what a ray meets, and from where the next may start.
 //! - [`bsdf`]: how light scatters at a surface.
 //! - [`lights`]: where light comes from and how shadow rays find it.
+//! - [`spherical`]: lamps as seen from a point close by.
 //! - [`sampler`]: where a path's random numbers come from.
 //! - [`trace`]: what a ray sees where it lands: the second door, and the path tracer.
 //! - [`gather`]: a record of irradiance is made.
@@ -22,6 +23,7 @@ pub mod world;
 
 pub mod bsdf;
 pub mod lights;
+pub mod spherical;
 
 pub mod sampler;
 pub mod trace;

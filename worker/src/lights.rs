@@ -10,6 +10,7 @@ use glam::Vec3;
 
 use crate::math::{Frame, luminance, sin_cos};
 use crate::scene::{DistantLight, PointLight, Rgb};
+use crate::spherical::SphericalTriangle;
 use crate::world::{World, facet};
 
 /// A material whose light covers at least this much of all surface is gathered by methods that gather: a gather's rays
@@ -124,15 +125,19 @@ impl Lights {
         self.cumulative[light as usize] - before
     }
 
-    /// Density, by solid angle, of looking for the light of a triangle from `distance` away, where a ray along
-    /// `direction` met it; 0 for light that is not sampled.
-    pub fn pdf_triangle(&self, triangle: u32, direction: Vec3, distance: f32) -> f32 {
+    /// Density, by solid angle, of looking from `from` for the light of a triangle, where a ray along `direction` met it
+    /// at `distance`; 0 for light that is not sampled.
+    pub fn pdf_triangle(&self, world: &World, triangle: u32, from: Vec3, direction: Vec3, distance: f32) -> f32 {
         let light = self.of_triangle[triangle as usize];
         if light == NONE {
             return 0.0;
         }
         let Light::Triangle { area, normal, .. } = self.lights[light as usize] else { return 0.0 };
-        self.chance(light) * distance * distance / (area * normal.dot(direction).abs())
+        let density = match SphericalTriangle::near(from, &world.scene.triangles[triangle as usize].positions) {
+            Some(near) => 1.0 / near.solid_angle,
+            None => distance * distance / (area * normal.dot(direction).abs()),
+        };
+        self.chance(light) * density
     }
 
     /// What a ray that meets nothing sees: for each distant light in that direction its radiance and its density, 0 for
@@ -151,14 +156,11 @@ impl Lights {
         let chance = self.chance(choice as u32);
         match self.lights[choice] {
             Light::Triangle { index, area, normal, emission } => {
-                let s = u[1].sqrt();
-                let end = world.off_front(index, s * (1.0 - u[2]), s * u[2]);
-                let offset = end - from;
-                let distance = offset.length();
-                let direction = offset / distance;
-                let cosine = -normal.dot(direction);
-                let pdf = chance * distance * distance / (area * cosine);
-                (cosine > 0.0 && pdf > 0.0 && pdf.is_finite()).then(|| Arrival {
+                let corners = &world.scene.triangles[index as usize].positions;
+                let (end, density) = point_on(corners, normal, area, from, [u[1], u[2]])?;
+                let (pdf, direction) = (chance * density, (end - from).normalize());
+                let end = world.off_front(index, end);
+                (pdf > 0.0 && pdf.is_finite() && end.is_finite()).then(|| Arrival {
                     direction,
                     end: Some(end),
                     weight: emission / pdf,
@@ -190,6 +192,23 @@ impl Lights {
             }
         }
     }
+}
+
+/// A point on a lamp and its density by solid angle, as seen from its front side; `None` from behind.
+fn point_on(corners: &[Vec3; 3], normal: Vec3, area: f32, from: Vec3, [u, v]: [f32; 2]) -> Option<(Vec3, f32)> {
+    let height = normal.dot(corners[0] - from);
+    if height >= 0.0 {
+        return None;
+    }
+    if let Some(near) = SphericalTriangle::near(from, corners) {
+        let direction = near.sample(u, v);
+        return Some((from + direction * (height / normal.dot(direction)), 1.0 / near.solid_angle));
+    }
+    let s = u.sqrt();
+    let end = corners[0] * (1.0 - s) + corners[1] * (s * (1.0 - v)) + corners[2] * (s * v);
+    let offset = end - from;
+    let cosine = -normal.dot(offset) / offset.length();
+    Some((end, offset.length_squared() / (area * cosine)))
 }
 
 /// Which materials' light shadow rays look for.

@@ -12,6 +12,11 @@ pub fn ln(x: f32) -> f32 {
     libm::logf(x)
 }
 
+/// Angle of the vector (`x`, `y`), radians.
+pub fn atan2(y: f32, x: f32) -> f32 {
+    libm::atan2f(y, x)
+}
+
 /// Luminance of linear RGB (Rec. 709).
 pub fn luminance(c: glam::Vec3) -> f32 {
     c.dot(glam::Vec3::new(0.2126, 0.7152, 0.0722))

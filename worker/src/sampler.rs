@@ -26,6 +26,11 @@ impl Sampler {
         Self::Pixel { index, seed, set: 0 }
     }
 
+    /// Independent numbers for a side task; this sampler goes on as if there had been none but four numbers.
+    pub fn branch(&mut self) -> Self {
+        Self::Stream(Random::named("branch", &self.next4().map(|x| x.to_bits().into())))
+    }
+
     /// The next four numbers.
     pub fn next4(&mut self) -> [f32; 4] {
         match self {

@@ -9,11 +9,14 @@
 use std::f32::consts::FRAC_1_PI;
 
 use cache_core::Query;
-use glam::Vec3;
+use cache_core::hemisphere::{Sample, Strata};
+use cache_core::irradiance::Answer;
+use glam::{Vec2, Vec3};
 
 use crate::bsdf::{Bsdf, Part};
 use crate::frame::{Counts, Levels};
 use crate::lights::Lights;
+use crate::math::Frame;
 use crate::sampler::Sampler;
 use crate::scene::Rgb;
 use crate::world::{Meeting, World};
@@ -36,6 +39,8 @@ pub struct Tracer<'a> {
     pub bounces: u32,
     /// Whether diffuse light may be left to records: then beyond the last bounce there is none to look for by chance.
     pub cached: bool,
+    /// Where no record covers what the camera sees, gather there and then with these cells; `None`: follow the path.
+    pub regather: Option<&'a Strata>,
 }
 
 /// What light a ray may bring back from lamps it meets by chance.
@@ -81,7 +86,7 @@ impl Tracer<'_> {
             counts.path_rays += 1;
             let meeting = self.world.meet(origin, direction);
             let emitted = match &meeting {
-                Some(at) => self.emitted(at, direction, chance),
+                Some(at) => self.emitted(at, origin, direction, chance),
                 None => self.beyond(direction, chance),
             };
             seen.add(throughput * emitted, depth <= first + 1 && first == 1);
@@ -95,7 +100,16 @@ impl Tracer<'_> {
             let Some(bsdf) = self.world.bsdf(&at) else { break };
             let outgoing = at.frame.to_local(-direction);
             let four = sampler.next4();
-            let part = self.answer(&at, &bsdf, depth, first, throughput, &mut seen, counts);
+            let part = match self.answer(&at, &bsdf, depth, sampler, counts) {
+                Some(answer) => {
+                    seen.indirect += throughput * bsdf.diffuse() * answer.irradiance * FRAC_1_PI;
+                    if depth == first {
+                        (seen.irradiance, seen.records) = (answer.irradiance, answer.records);
+                    }
+                    Part::Gloss
+                }
+                None => Part::All,
+            };
             let lamps = self.lamps(&at, &bsdf, outgoing, part, [four[0], four[1], four[2]], counts);
             seen.add(throughput * lamps, depth == 1);
             let next = sampler.next4();
@@ -119,36 +133,58 @@ impl Tracer<'_> {
         seen
     }
 
-    /// Adds what the records of this depth say, and tells what is left to follow.
-    #[allow(clippy::too_many_arguments)]
+    /// Irradiance at a surface as far as records, or a small gather in their place, can tell it; `None`: follow the path.
     fn answer(
         &self,
         at: &Meeting,
         bsdf: &Bsdf,
         depth: u32,
-        first: u32,
-        throughput: Rgb,
-        seen: &mut Seen,
+        sampler: &mut Sampler,
         counts: &mut Counts,
-    ) -> Part {
+    ) -> Option<Answer> {
         if bsdf.diffuse() == Rgb::ZERO {
-            return Part::All;
+            return None;
         }
-        if let Some(level) = self.levels.get(depth as usize - 1) {
-            counts.queries += 1;
-            let Some(answer) = level.ask(&Query { position: at.position, normal: at.normal() }) else {
-                counts.misses += 1;
-                return Part::All;
-            };
-            seen.indirect += throughput * bsdf.diffuse() * answer.irradiance * FRAC_1_PI;
-            if depth == first {
-                (seen.irradiance, seen.records) = (answer.irradiance, answer.records);
+        let Some(level) = self.levels.get(depth as usize - 1) else {
+            // The last bounce reflects lamps, which shadow rays find, and gathered light: without any, nothing is left.
+            let nothing_left = self.cached && depth - 1 == self.bounces && !self.lights.any_gathered();
+            return nothing_left.then(Answer::default);
+        };
+        counts.queries += 1;
+        let answer = level.ask(&Query { position: at.position, normal: at.normal() });
+        if answer.is_some() {
+            return answer;
+        }
+        counts.misses += 1;
+        self.regather.map(|strata| {
+            // Only what the camera sees is worth a gather of its own: its rays follow paths.
+            let tracer = Tracer { regather: None, ..*self };
+            let samples = tracer.hemisphere(at, at.frame, depth, strata, &mut sampler.branch(), counts);
+            Answer { irradiance: strata.estimate(&samples).irradiance, records: 0 }
+        })
+    }
+
+    /// What the rays of a gather bring back to a surface of `depth`, cell by cell of a hemisphere round `frame`.
+    pub fn hemisphere(
+        &self,
+        at: &Meeting,
+        frame: Frame,
+        depth: u32,
+        strata: &Strata,
+        sampler: &mut Sampler,
+        counts: &mut Counts,
+    ) -> Vec<Sample> {
+        let mut ray = |cell| {
+            let [u, v, ..] = sampler.next4();
+            let direction = frame.to_world(strata.direction(cell, Vec2::new(u, v))).normalize();
+            if direction.dot(at.facet) <= 0.0 {
+                // Below the facet of a smooth surface: the surface hides itself, at no distance worth counting.
+                return Sample { radiance: Rgb::ZERO, distance: f32::INFINITY };
             }
-            return Part::Gloss;
-        }
-        // The last bounce reflects lamps, which shadow rays find, and gathered light: without any, nothing is left.
-        let nothing_left = self.cached && depth - 1 == self.bounces && !self.lights.any_gathered();
-        if nothing_left { Part::Gloss } else { Part::All }
+            let seen = self.see((at.leave(direction), direction), depth + 1, Chance::Gathered, sampler, counts);
+            Sample { radiance: seen.total().max(Rgb::ZERO), distance: seen.distance }
+        };
+        (0..strata.rays()).map(&mut ray).collect()
     }
 
     /// Reflected light of one lamp looked for by a shadow ray. `part` is what will be followed by chance as well.
@@ -178,16 +214,35 @@ impl Tracer<'_> {
         if hidden { Rgb::ZERO } else { light }
     }
 
-    fn emitted(&self, at: &Meeting, direction: Vec3, chance: Chance) -> Rgb {
+    fn emitted(&self, at: &Meeting, from: Vec3, direction: Vec3, chance: Chance) -> Rgb {
         let emission = self.world.emission(at);
         if emission == Rgb::ZERO {
             return emission;
         }
-        emission * share(chance, || self.lights.pdf_triangle(at.triangle, direction, at.distance))
+        let sampled = self.lights.samples_triangle(at.triangle);
+        match chance {
+            Chance::All => emission,
+            Chance::Gathered => {
+                if sampled {
+                    Rgb::ZERO
+                } else {
+                    emission
+                }
+            }
+            Chance::Weighed(own) => {
+                emission
+                    * heuristic(own, self.lights.pdf_triangle(self.world, at.triangle, from, direction, at.distance))
+            }
+        }
     }
 
     fn beyond(&self, direction: Vec3, chance: Chance) -> Rgb {
-        self.lights.beyond(self.world, direction).map(|(radiance, pdf)| radiance * share(chance, || pdf)).sum()
+        let share = |pdf: f32| match chance {
+            Chance::All => 1.0,
+            Chance::Gathered => f32::from(pdf == 0.0),
+            Chance::Weighed(own) => heuristic(own, pdf),
+        };
+        self.lights.beyond(self.world, direction).map(|(radiance, pdf)| radiance * share(pdf)).sum()
     }
 }
 
@@ -203,15 +258,6 @@ impl Seen {
     /// All light.
     pub fn total(&self) -> Rgb {
         self.direct + self.indirect
-    }
-}
-
-/// How much of met light counts; `pdf` is the density of looking for it, 0 where nobody looks.
-fn share(chance: Chance, pdf: impl FnOnce() -> f32) -> f32 {
-    match chance {
-        Chance::All => 1.0,
-        Chance::Gathered => f32::from(pdf() == 0.0),
-        Chance::Weighed(own) => heuristic(own, pdf()),
     }
 }
 

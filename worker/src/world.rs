@@ -72,9 +72,17 @@ impl World {
             // Seen from behind by its own shading normal: fall back on the facet.
             if smooth.dot(direction) < 0.0 { smooth } else { facet }
         });
-        let lift = LIFT * triangle.positions.iter().map(|p| p.abs().max_element()).fold(0.0, f32::max);
         let frame = Frame::around(normal);
-        Some(Meeting { position, distance: hit.t, facet, frame, triangle: hit.triangle, front, weights, lift })
+        Some(Meeting {
+            position,
+            distance: hit.t,
+            facet,
+            frame,
+            triangle: hit.triangle,
+            front,
+            weights,
+            lift: lift(triangle),
+        })
     }
 
     /// Whether something lies between two points that are already off their surfaces.
@@ -111,11 +119,10 @@ impl World {
         if at.front { self.scene.materials[triangle.material as usize].emission } else { Rgb::ZERO }
     }
 
-    /// A point of a triangle (barycentric weights `b`, `c` of its second and third corner), just off its front.
-    pub fn off_front(&self, triangle: u32, b: f32, c: f32) -> Vec3 {
+    /// A point on a triangle, moved just off its front.
+    pub fn off_front(&self, triangle: u32, point: Vec3) -> Vec3 {
         let triangle = &self.scene.triangles[triangle as usize];
-        let lift = LIFT * triangle.positions.iter().map(|p| p.abs().max_element()).fold(0.0, f32::max);
-        blend(&triangle.positions, [1.0 - b - c, b, c]) + facet(triangle) * lift
+        point + facet(triangle) * lift(triangle)
     }
 }
 
@@ -142,4 +149,8 @@ pub fn facet(triangle: &Triangle) -> Vec3 {
 
 fn blend(corners: &[Vec3; 3], weights: [f32; 3]) -> Vec3 {
     corners[0] * weights[0] + corners[1] * weights[1] + corners[2] * weights[2]
+}
+
+fn lift(triangle: &Triangle) -> f32 {
+    LIFT * triangle.positions.iter().map(|p| p.abs().max_element()).fold(0.0, f32::max)
 }
