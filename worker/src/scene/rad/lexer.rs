@@ -24,14 +24,16 @@ pub(super) struct Lexer<'a> {
     file: &'a str,
     bytes: &'a [u8],
     at: usize,
+    /// Line of the next byte.
+    current: usize,
+    /// Line of what was read last.
     line: usize,
-    token_line: usize,
 }
 
 impl<'a> Lexer<'a> {
     /// Starts at the first byte; `file` is only for messages.
     pub(super) fn new(file: &'a str, bytes: &'a [u8]) -> Self {
-        Self { file, bytes, at: 0, line: 1, token_line: 1 }
+        Self { file, bytes, at: 0, current: 1, line: 1 }
     }
 
     /// The file's name, for messages.
@@ -41,18 +43,18 @@ impl<'a> Lexer<'a> {
 
     /// Line of what was read last, counted from 1.
     pub(super) fn line(&self) -> usize {
-        self.token_line
+        self.line
     }
 
     /// An error at the line of what was read last.
     pub(super) fn error(&self, message: impl std::fmt::Display) -> SceneError {
-        SceneError(format!("{}:{}: {message}", self.file, self.token_line))
+        SceneError(format!("{}:{}: {message}", self.file, self.line))
     }
 
     /// Goes to the next object or command; `None` at the end of the file.
     pub(super) fn item(&mut self) -> Option<Item> {
         self.skip_space_and_comments();
-        self.token_line = self.line;
+        self.line = self.current;
         match self.peek()? {
             b'!' => {
                 self.at += 1;
@@ -66,7 +68,7 @@ impl<'a> Lexer<'a> {
     pub(super) fn word(&mut self, what: &str) -> Result<&'a [u8], SceneError> {
         self.skip_space();
         let Some(first) = self.peek() else { return Err(self.at_end(what)) };
-        self.token_line = self.line;
+        self.line = self.current;
         if first == b'"' || first == b'\'' { self.quoted(first) } else { Ok(self.take(is_space)) }
     }
 
@@ -81,7 +83,7 @@ impl<'a> Lexer<'a> {
 
     /// The next real number, finite.
     pub(super) fn real(&mut self, what: std::fmt::Arguments) -> Result<f64, SceneError> {
-        let token = self.number(&what)?;
+        let token = self.number(what)?;
         finite(token).ok_or_else(|| self.error(format_args!("{what} is `{}`; expected a finite number", show(token))))
     }
 
@@ -90,7 +92,7 @@ impl<'a> Lexer<'a> {
     }
 
     fn at_end(&mut self, what: impl std::fmt::Display) -> SceneError {
-        self.token_line = self.line;
+        self.line = self.current;
         self.error(format_args!("the file ends where {what} was expected"))
     }
 
@@ -107,7 +109,7 @@ impl<'a> Lexer<'a> {
         if self.at == self.bytes.len() {
             return Err(self.at_end(what));
         }
-        self.token_line = self.line;
+        self.line = self.current;
         Ok(self.take(|b| is_space(b) || b == b'#'))
     }
 
@@ -124,7 +126,7 @@ impl<'a> Lexer<'a> {
 
     fn skip_space(&mut self) {
         while let Some(byte) = self.peek().filter(|&b| is_space(b)) {
-            self.line += usize::from(byte == b'\n');
+            self.current += usize::from(byte == b'\n');
             self.at += 1;
         }
     }
@@ -143,7 +145,7 @@ impl<'a> Lexer<'a> {
             self.at += 1;
             match byte {
                 b'\n' => {
-                    self.line += 1;
+                    self.current += 1;
                     if text.last() != Some(&b'\\') {
                         break;
                     }

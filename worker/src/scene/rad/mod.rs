@@ -66,7 +66,7 @@ impl Source {
     }
 
     fn directory(&self) -> &Path {
-        self.path.parent().unwrap_or(Path::new(""))
+        self.path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
     }
 }
 

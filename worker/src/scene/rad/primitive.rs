@@ -17,6 +17,8 @@ pub(super) const TYPES: [&[u8]; 9] =
 const FAR: f64 = 1e9;
 /// Most triangles of a scene; more do not fit the memory of a usual machine, and arrays of arrays reach it soon.
 const MAX_TRIANGLES: usize = 50_000_000;
+/// Most points of a polygon. The time to find out that an outline crosses itself grows with the third power.
+const MAX_POINTS: usize = 10_000;
 /// Half angle in degrees below which a source becomes a beam, see `source`.
 const BEAM: f64 = 0.15;
 /// Half angle in degrees below which the rounding of its cosine to 32 bits is made good, see `source`.
@@ -103,12 +105,17 @@ struct Shape<'a, 'b> {
 impl Shape<'_, '_> {
     fn polygon(&self, sink: &mut Sink) -> Result<(), SceneError> {
         let reals = &self.statement.reals;
-        if reals.len() < 9 || reals.len() % 3 != 0 || !self.statement.strings.is_empty() {
+        if reals.len() < 9 || !reals.len().is_multiple_of(3) || !self.statement.strings.is_empty() {
             return Err(self.statement.error(format_args!(
                 "has {} strings and {} numbers; expected none and three for each of at least three points",
                 self.statement.strings.len(),
                 reals.len()
             )));
+        }
+        if reals.len() > 3 * MAX_POINTS {
+            return Err(self
+                .statement
+                .error(format_args!("has {} points; expected at most {MAX_POINTS}", reals.len() / 3)));
         }
         let mut points = (0..reals.len()).step_by(3).map(|i| self.point(i)).collect::<Result<Vec<_>, _>>()?;
         // The sink turns surfaces inside out; what is left is a mirror's effect on the sense of rotation.

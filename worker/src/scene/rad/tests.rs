@@ -1,3 +1,5 @@
+//! Scenes of a few lines, against what the manual says they are.
+
 use std::f64::consts::PI;
 use std::path::Path;
 
