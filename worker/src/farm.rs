@@ -388,11 +388,10 @@ impl Worker {
         let loading = tokio::task::spawn_blocking(move || prepare(&described));
         let frame = loading.await.map_err(|panic| Fault::Unfit(format!("the worker failed: {panic}")))?;
         let frame = frame.map_err(|e| Fault::Unfit(format!("{e:#}")))?;
-        let (namespace, settings) = (*frame.namespace(), frame.settings());
+        let (namespace, levels) = (*frame.namespace(), frame.levels());
         let start = || Arc::new(Follower::start(self.cache.clone(), namespace));
-        let follows = settings.levels() > 0;
-        let follower = follows.then(|| lock(&self.followers).entry(namespace).or_insert_with(start).clone());
-        let caches = Arc::new(Mutex::new(Caches::new(settings.a, settings.levels())));
+        let follower = (levels > 0).then(|| lock(&self.followers).entry(namespace).or_insert_with(start).clone());
+        let caches = Arc::new(Mutex::new(Caches::new(frame.settings().a, levels)));
         Ok(Arc::new(Loaded { frame: Arc::new(frame), follower, caches }))
     }
 
@@ -424,6 +423,8 @@ fn prepare(described: &v1::FrameSpec) -> anyhow::Result<Frame> {
         frame.namespace().0[..] == described.namespace[..],
         "these settings lead to another namespace here: other builds of ambience at work"
     );
+    let (here, there) = (frame.levels(), described.levels);
+    anyhow::ensure!(here == there, "the frame has {there} levels, {here} here: other builds of ambience at work");
     Ok(frame)
 }
 

@@ -1,14 +1,38 @@
 //! One frame as a worker sees it: the scene ready to trace, and the two kinds of work it leases.
 
+use std::ops::Range;
 use std::sync::Arc;
 
-use cache_core::{Irradiance, Namespace, Sealed};
+use cache_core::hemisphere::Strata;
+use cache_core::id::Random;
+use cache_core::{Irradiance, Namespace, Query, Sealed, rounds};
 
-use crate::scene::Scene;
-use crate::settings::Settings;
+use crate::bsdf::Part;
+use crate::gather::{Gather, Site};
+use crate::lights::Lights;
+use crate::sampler::Sampler;
+use crate::scene::{Rgb, Scene};
+use crate::settings::{Method, Settings};
+use crate::trace::{Chance, Tracer};
+use crate::world::World;
 
 /// Floats a pixel in a finished tile: beauty, direct, indirect, irradiance (RGB each), and how many records answered.
 pub const CHANNELS: usize = 13;
+
+/// Levels of records worth filling; deeper light continues as paths.
+const LEVELS_MAX: u32 = 2;
+
+/// Reach a record has at least, in pixels as projected at its site: level 1, and deeper levels.
+const REACH_MIN_PIXELS: [f32; 2] = [2.0, 6.0];
+
+/// Greatest over least reach (course slides: Radiance takes 64, Tabellion and Lamorlette 2004 about 7).
+const REACH_RATIO: f32 = 32.0;
+
+/// Rays of a deeper level's gather, as a fraction: its error is averaged over many rays of the level above.
+const DEEPER_RAYS: f32 = 0.25;
+
+/// Rays gathered for a sample of a pixel that no record covers, as a fraction: its pixel's other samples share the error.
+const MISSED_RAYS: f32 = 0.0625;
 
 /// The sealed records of every level; `[0]` is level 1. Cheap to clone.
 pub type Levels = Vec<Arc<Sealed<Irradiance>>>;
@@ -16,30 +40,34 @@ pub type Levels = Vec<Arc<Sealed<Irradiance>>>;
 /// What was counted while working, for the statistics.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Counts {
-    /// Rays of gathers (their paths included).
-    pub gather_rays: u64,
-    /// Rays from the camera and mirrors.
-    pub pixel_rays: u64,
+    /// Rays that look for surfaces, of pixels, gathers and their paths.
+    pub path_rays: u64,
     /// Rays that only ask whether a light is hidden.
     pub shadow_rays: u64,
-    /// Samples of pixels that wanted an answer from the cache.
+    /// Points that wanted an answer from the cache.
     pub queries: u64,
-    /// Those that found no record.
+    /// Those that found no record and went on as paths.
     pub misses: u64,
 }
 
 /// A scene ready to be rendered with certain settings.
 pub struct Frame {
-    scene: Scene,
+    world: World,
+    lights: Lights,
     settings: Settings,
     namespace: Namespace,
+    /// Cells of a gather at level 1, at deeper ones, and for a sample of a pixel that no record covers.
+    strata: [Strata; 3],
 }
 
 impl Frame {
     /// Builds what rendering needs.
     pub fn new(scene: Scene, settings: Settings) -> Self {
         let namespace = settings.namespace(&scene.hash);
-        Self { scene, settings, namespace }
+        let world = World::new(scene);
+        let lights = Lights::new(&world, settings.method != Method::Path);
+        let strata = [1.0, DEEPER_RAYS, MISSED_RAYS].map(|f| Strata::new((settings.rays as f32 * f) as u32));
+        Self { world, lights, settings, namespace, strata }
     }
 
     /// The settings it was made with.
@@ -52,22 +80,102 @@ impl Frame {
         &self.namespace
     }
 
+    /// Levels of records worth filling: one for each bounce and one for gathered light, as far as the method goes.
+    pub fn levels(&self) -> u32 {
+        let s = &self.settings;
+        match s.method {
+            Method::Path => 0,
+            Method::Irradiance => s.bounces.saturating_add(self.lights.any_gathered().into()).min(LEVELS_MAX),
+        }
+    }
+
     /// Tests the candidates of `tile` whose ranks lie in `ranks` and gathers a record of `level` where the sealed
     /// cache covers none. The result depends on nothing but the frame, the arguments and the sealed records.
-    pub fn fill(
-        &self,
-        _level: u32,
-        _ranks: std::ops::Range<u32>,
-        _tile: u32,
-        _sealed: &Levels,
-    ) -> (Vec<Irradiance>, Counts) {
-        (Vec::new(), Counts::default())
+    pub fn fill(&self, level: u32, ranks: Range<u32>, tile: u32, sealed: &Levels) -> (Vec<Irradiance>, Counts) {
+        let mut counts = Counts::default();
+        let mut records = Vec::new();
+        for [x, y] in self.settings.pixels(tile) {
+            if ranks.contains(&rounds::rank(x, y))
+                && let Some(record) = self.candidate(level, x, y, sealed, &mut counts)
+            {
+                records.push(record);
+            }
+        }
+        (records, counts)
+    }
+
+    /// Tests one pixel's candidate and gathers its record where the sealed cache covers none.
+    pub fn candidate(&self, level: u32, x: u32, y: u32, sealed: &Levels, counts: &mut Counts) -> Option<Irradiance> {
+        let site = self.site(level, x, y, counts)?;
+        let query = Query { position: site.at.position, normal: site.at.normal() };
+        if sealed.get(level as usize - 1).is_some_and(|s| s.covers(&query)) {
+            return None;
+        }
+        // The level being filled is no business of its own gathers.
+        let gather = Gather {
+            tracer: &self.tracer(sealed),
+            namespace: &self.namespace,
+            seed: self.settings.seed,
+            level,
+            strata: &self.strata[usize::from(level > 1)],
+        };
+        Some(gather.record(&site, counts))
+    }
+
+    fn tracer<'a>(&'a self, levels: &'a Levels) -> Tracer<'a> {
+        let cached = self.settings.method != Method::Path;
+        let bounces = self.settings.bounces;
+        Tracer { world: &self.world, lights: &self.lights, levels, bounces, cached, regather: None }
+    }
+
+    /// The candidate of a pixel: the diffuse surface where a path from its middle has its `level`th meeting.
+    fn site(&self, level: u32, x: u32, y: u32, counts: &mut Counts) -> Option<Site> {
+        let s = &self.settings;
+        let (mut origin, mut direction) = s.ray(x as f32 + 0.5, y as f32 + 0.5);
+        let mut sampler = Sampler::Stream(Random::named("walk", &[s.seed, x.into(), y.into(), level.into()]));
+        let mut way = 0.0;
+        for depth in 1.. {
+            counts.path_rays += 1;
+            let at = self.world.meet(origin, direction)?;
+            way += at.distance;
+            let bsdf = self.world.bsdf(&at)?;
+            if depth == level {
+                let reach = REACH_MIN_PIXELS[usize::from(level > 1)] * s.pixel_size(way);
+                let radius_min = (reach / s.a).max(f32::MIN_POSITIVE);
+                let radius_bounds = (radius_min, radius_min * REACH_RATIO);
+                return (bsdf.diffuse() != Rgb::ZERO).then_some(Site { at, radius_bounds });
+            }
+            let [a, b, c, _] = sampler.next4();
+            let scatter = bsdf.sample(at.frame.to_local(-direction), Part::All, [a, b, c])?;
+            direction = at.frame.to_world(scatter.incoming).normalize();
+            if direction.dot(at.facet) <= 0.0 {
+                return None;
+            }
+            origin = at.leave(direction);
+        }
+        None
     }
 
     /// The finished pixels of `tile`, row by row, [`CHANNELS`] floats each.
-    pub fn pixels(&self, tile: u32, _sealed: &Levels) -> (Vec<f32>, Counts) {
-        let [x0, x1, y0, y1] = self.settings.tile(tile);
-        let count = ((x1 - x0) * (y1 - y0)) as usize * CHANNELS;
-        (vec![self.scene.triangles.len() as f32; count], Counts::default())
+    pub fn pixels(&self, tile: u32, sealed: &Levels) -> (Vec<f32>, Counts) {
+        let mut counts = Counts::default();
+        let tracer = Tracer { regather: Some(&self.strata[2]), ..self.tracer(sealed) };
+        let mut pixels = Vec::new();
+        for [x, y] in self.settings.pixels(tile) {
+            let seed =
+                (Random::named("pixel", &[self.settings.seed, x.into(), y.into()]).next() * (1 << 24) as f32) as u32;
+            let mut sum = [0f32; CHANNELS];
+            for index in 0..self.settings.spp {
+                let mut sampler = Sampler::pixel(index, seed);
+                let [u, v, ..] = sampler.next4();
+                let ray = self.settings.ray(x as f32 + u, y as f32 + v);
+                let seen = tracer.see(ray, 1, Chance::All, &mut sampler, &mut counts);
+                let layers = [seen.total(), seen.direct, seen.indirect, seen.irradiance];
+                let floats = layers.iter().flat_map(|l| l.to_array()).chain([seen.records as f32]);
+                sum.iter_mut().zip(floats).for_each(|(sum, value)| *sum += value);
+            }
+            pixels.extend(sum.map(|s| s / self.settings.spp as f32));
+        }
+        (pixels, counts)
     }
 }

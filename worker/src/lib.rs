@@ -2,9 +2,17 @@
 //!
 //! In the order of the flow, one sentence each:
 //!
-//! - [`scene`]: the scene as plain data, and its loaders.
-//! - [`settings`]: what a picture depends on besides the scene.
-//! - [`frame`]: a scene ready to be rendered, and the two kinds of work on it.
+//! - [`scene`]: plain data from glTF and Radiance files.
+//! - [`settings`]: what a picture depends on besides its scene.
+//! - [`bvh`]: rays against triangles.
+//! - [`world`]: what a ray meets, and from where the next may start.
+//! - [`bsdf`]: how light scatters at a surface.
+//! - [`lights`]: where light comes from and how shadow rays find it.
+//! - [`spherical`]: lamps as seen from a point close by.
+//! - [`sampler`]: where a path's random numbers come from.
+//! - [`trace`]: what a ray sees where it lands: the second door, and the path tracer.
+//! - [`gather`]: a record of irradiance is made.
+//! - [`frame`]: the two kinds of work a worker leases: filling rounds and making pixels.
 //! - [`spec`]: settings on the wire.
 //! - [`client`]: the connection to a server.
 //! - [`replica`]: a copy of a namespace's log, and the caches sealed from a prefix of it.
@@ -13,9 +21,22 @@
 //! - [`farm`]: the worker process.
 //! - [`film`]: tiles become OUT.exr and OUT.png.
 //! - [`compare`]: how far a picture is from a reference.
+//! - [`math`]: functions whose bits are the same everywhere.
 
 pub mod scene;
 pub mod settings;
+
+pub mod bvh;
+pub mod world;
+
+pub mod bsdf;
+pub mod lights;
+pub mod spherical;
+
+pub mod sampler;
+pub mod trace;
+
+pub mod gather;
 
 pub mod frame;
 
@@ -28,3 +49,5 @@ pub mod task;
 
 pub mod compare;
 pub mod film;
+
+pub mod math;

@@ -1,6 +1,7 @@
 //! What a picture depends on besides the scene: the settings users choose, and the namespace they lead to.
 
 use cache_core::Namespace;
+use glam::Vec3;
 
 use crate::scene::Camera;
 
@@ -60,18 +61,7 @@ pub struct Settings {
 /// Edge of a tile in pixels.
 pub const TILE: u32 = 16;
 
-/// Levels of records worth filling when every bounce is asked for; deeper light continues as paths.
-const LEVELS_MAX: u32 = 2;
-
 impl Settings {
-    /// Levels of records the method fills; 0 for methods without.
-    pub fn levels(&self) -> u32 {
-        match self.method {
-            Method::Path => 0,
-            Method::Irradiance => self.bounces.saturating_add(1).min(LEVELS_MAX),
-        }
-    }
-
     /// Tiles of the picture, numbered row by row.
     pub fn tiles(&self) -> u32 {
         self.width.div_ceil(TILE) * self.height.div_ceil(TILE)
@@ -82,6 +72,23 @@ impl Settings {
         let columns = self.width.div_ceil(TILE);
         let (x, y) = (tile % columns * TILE, tile / columns * TILE);
         [x, (x + TILE).min(self.width), y, (y + TILE).min(self.height)]
+    }
+
+    /// The pixels of a tile, row by row.
+    pub fn pixels(&self, tile: u32) -> impl Iterator<Item = [u32; 2]> + use<> {
+        let [x0, x1, y0, y1] = self.tile(tile);
+        (y0..y1).flat_map(move |y| (x0..x1).map(move |x| [x, y]))
+    }
+
+    /// Origin and unit direction of the ray through pixel coordinates; (0, 0) is the top left corner of the picture.
+    pub fn ray(&self, x: f32, y: f32) -> (Vec3, Vec3) {
+        self.camera.ray(2.0 * x / self.width as f32 - 1.0, 1.0 - 2.0 * y / self.height as f32)
+    }
+
+    /// Edge of a pixel projected `way` along its ray, world length.
+    pub fn pixel_size(&self, way: f32) -> f32 {
+        let edge = 2.0 * self.camera.up.length() / self.height as f32;
+        if self.camera.parallel { edge } else { edge * way }
     }
 
     /// The namespace of the records: scene content and what changes a record's value. The camera, the size and `spp`

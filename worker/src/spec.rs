@@ -4,11 +4,16 @@ use cache_core::Namespace;
 use cache_proto::v1;
 use glam::Vec3;
 
+use crate::frame::Frame;
 use crate::scene::Camera;
 use crate::settings::{Method, Settings, TILE};
 
 /// The message that describes a frame of the scene at `path` (as every worker can open it) with content `hash`.
-pub fn message(settings: &Settings, path: &str, hash: &[u8; 32], namespace: &Namespace) -> v1::FrameSpec {
+pub fn message(frame: &Frame, path: &str, hash: &[u8; 32]) -> v1::FrameSpec {
+    written(frame.settings(), frame.levels(), frame.namespace(), path, hash)
+}
+
+fn written(settings: &Settings, levels: u32, namespace: &Namespace, path: &str, hash: &[u8; 32]) -> v1::FrameSpec {
     let camera = &settings.camera;
     v1::FrameSpec {
         scene: path.into(),
@@ -30,7 +35,7 @@ pub fn message(settings: &Settings, path: &str, hash: &[u8; 32], namespace: &Nam
         rays: settings.rays,
         bounces: settings.bounces,
         seed: settings.seed,
-        levels: settings.levels(),
+        levels,
     }
 }
 
@@ -66,9 +71,6 @@ pub fn settings(spec: &v1::FrameSpec) -> Result<Settings, String> {
     check(&settings)?;
     if spec.tile_size != TILE {
         return Err(format!("tile_size is {}, expected {TILE}", spec.tile_size));
-    }
-    if spec.levels != settings.levels() {
-        return Err(format!("levels is {}, expected {}", spec.levels, settings.levels()));
     }
     Ok(settings)
 }
@@ -118,13 +120,13 @@ pub(crate) mod tests {
 
     #[test]
     fn settings_survive_the_wire_bit_for_bit() {
-        let spec = message(&sample(), "/a", &[1; 32], &Namespace([2; 32]));
+        let spec = written(&sample(), 2, &Namespace([2; 32]), "/a", &[1; 32]);
         assert_eq!(settings(&spec), Ok(sample()));
     }
 
     #[test]
     fn what_is_out_of_range_is_named() {
-        let spec = message(&sample(), "/a", &[1; 32], &Namespace([2; 32]));
+        let spec = written(&sample(), 2, &Namespace([2; 32]), "/a", &[1; 32]);
         let wrong = |change: fn(&mut v1::FrameSpec)| {
             let mut spec = spec.clone();
             change(&mut spec);
@@ -134,7 +136,6 @@ pub(crate) mod tests {
         assert_eq!(wrong(|s| s.a = f32::NAN), "a is NaN, expected more than 0 and at most 10");
         assert_eq!(wrong(|s| s.method = "magic".into()), "method \"magic\" is unknown here");
         assert_eq!(wrong(|s| s.tile_size = 8), "tile_size is 8, expected 16");
-        assert_eq!(wrong(|s| s.levels = 7), "levels is 7, expected 2");
         assert_eq!(wrong(|s| s.camera = None), "the frame has no camera");
     }
 }

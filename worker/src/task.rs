@@ -54,16 +54,15 @@ pub fn run(
 
 impl Done {
     fn add(&mut self, counts: &Counts) {
-        self.counts.gather_rays += counts.gather_rays;
-        self.counts.pixel_rays += counts.pixel_rays;
+        self.counts.path_rays += counts.path_rays;
         self.counts.shadow_rays += counts.shadow_rays;
         self.counts.queries += counts.queries;
         self.counts.misses += counts.misses;
     }
 
-    /// The counts of `Complete`: `cpu_seconds.PHASE` and `records.PHASE` (PHASE is `level N` or `pixels`),
-    /// `rays.gather`, `rays.pixel`, `rays.shadow`, `queries`, `misses`, and of bytes on the wire `bytes.inserted` and
-    /// `bytes.subscribed` (packed records), `bytes.tiles` (packed pixels).
+    /// The counts of `Complete`: `cpu_seconds.PHASE`, `records.PHASE`, `rays.path.PHASE`, `rays.shadow.PHASE` (PHASE is
+    /// `level N` or `pixels`), `queries`, `misses`, and of bytes on the wire `bytes.inserted` and `bytes.subscribed`
+    /// (packed records), `bytes.tiles` (packed pixels).
     pub fn counts(&self, step: &v1::Step, inserted: u64, subscribed: u64) -> Vec<v1::Count> {
         let phase = match step.level {
             0 => "pixels".to_string(),
@@ -73,9 +72,8 @@ impl Done {
         let all = [
             (format!("cpu_seconds.{phase}"), self.cpu_seconds),
             (format!("records.{phase}"), self.records.len() as f64),
-            ("rays.gather".into(), self.counts.gather_rays as f64),
-            ("rays.pixel".into(), self.counts.pixel_rays as f64),
-            ("rays.shadow".into(), self.counts.shadow_rays as f64),
+            (format!("rays.path.{phase}"), self.counts.path_rays as f64),
+            (format!("rays.shadow.{phase}"), self.counts.shadow_rays as f64),
             ("queries".into(), self.counts.queries as f64),
             ("misses".into(), self.counts.misses as f64),
             ("bytes.inserted".into(), inserted as f64),

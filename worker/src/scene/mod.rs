@@ -10,6 +10,7 @@ use glam::{Vec2, Vec3};
 pub mod camera;
 mod gltf;
 mod rad;
+mod texture;
 mod view;
 
 pub use camera::Camera;

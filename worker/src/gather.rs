@@ -1,0 +1,77 @@
+//! A record of irradiance is made: stratified rays from a site, each bringing back what it sees where it lands.
+
+use cache_core::hemisphere::Strata;
+use cache_core::id::{Origin, Random};
+use cache_core::math::Frame;
+use cache_core::{Cached, Irradiance, Namespace};
+use glam::Vec2;
+
+use crate::frame::Counts;
+use crate::sampler::Sampler;
+use crate::trace::Tracer;
+use crate::world::Meeting;
+
+/// Where a record is wanted.
+pub struct Site {
+    /// The surface there.
+    pub at: Meeting,
+    /// Least and greatest R of the record, world lengths.
+    pub radius_bounds: (f32, f32),
+}
+
+/// What a gather needs besides its site.
+pub struct Gather<'a> {
+    /// Traces its rays; reads the sealed levels below.
+    pub tracer: &'a Tracer<'a>,
+    /// Namespace of the record.
+    pub namespace: &'a Namespace,
+    /// The user's seed.
+    pub seed: u64,
+    /// Level of the record.
+    pub level: u32,
+    /// Cells of the hemisphere.
+    pub strata: &'a Strata,
+}
+
+impl Gather<'_> {
+    /// Makes the record of a site: the same record, bit for bit, whoever makes it and when.
+    pub fn record(&self, site: &Site, counts: &mut Counts) -> Irradiance {
+        let (position, normal) = (site.at.position, site.at.normal());
+        let (radius_min, radius_max) = site.radius_bounds;
+        let read = self.tracer.levels.get(self.level as usize).map(|l| l.digest()).unwrap_or_default();
+        let key = [position.x, position.y, position.z, normal.x, normal.y, normal.z, radius_min, radius_max];
+        let origin = Origin {
+            namespace: self.namespace,
+            kind: Irradiance::KIND,
+            level: self.level,
+            site: &key,
+            seed: self.seed,
+            read,
+        };
+        let id = origin.id();
+        let mut random = Random::of(id);
+        // A turn of the strata about the normal, so that neighbouring records do not err alike.
+        let frame = turned(site.at.frame, random.next());
+        let mut sampler = Sampler::Stream(random);
+        let samples = self.tracer.hemisphere(&site.at, frame, self.level, self.strata, &mut sampler, counts);
+        let estimate = self.strata.estimate(&samples);
+        let own = |v: Vec2| site.at.frame.tangential(frame.x * v.x + frame.y * v.y);
+        Irradiance {
+            id,
+            position,
+            normal,
+            radius: estimate.radius.clamp(f32::MIN_POSITIVE, 4.0 * self.tracer.world.radius),
+            radius_min,
+            radius_max,
+            irradiance: estimate.irradiance,
+            gradient_t: estimate.gradient_t.map(own),
+            gradient_r: estimate.gradient_r.map(own),
+        }
+    }
+}
+
+/// The frame turned about its normal by a fraction of a full turn.
+fn turned(frame: Frame, fraction: f32) -> Frame {
+    let (s, c) = cache_core::math::sin_cos(fraction * std::f32::consts::TAU);
+    Frame { x: frame.x * c + frame.y * s, y: frame.y * c - frame.x * s, z: frame.z }
+}

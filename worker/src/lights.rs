@@ -1,0 +1,231 @@
+//! Where light comes from, and how shadow rays find it: one light per request, chosen by its power.
+//!
+//! Light is *sampled* (shadow rays look for it; rays that meet it by chance count only by multiple importance sampling)
+//! or *gathered* (only rays that meet it by chance count; a record of irradiance includes it). Which one makes no
+//! difference to a converged picture: small bright lights are found by looking, broad dim ones by chance.
+
+use std::f32::consts::PI;
+
+use glam::Vec3;
+
+use crate::math::{Frame, luminance, sin_cos};
+use crate::scene::{DistantLight, PointLight, Rgb};
+use crate::spherical::SphericalTriangle;
+use crate::world::{World, facet};
+
+/// A material whose light covers at least this much of all surface is gathered by methods that gather: a gather's rays
+/// meet it often, and shadow rays to so broad a light would be noisy.
+const BROAD: f32 = 0.125;
+
+/// A distant light at least this broad (cosine of its half angle) is gathered.
+const BROAD_COSINE: f32 = 0.9;
+
+/// What shadow rays can ask.
+pub struct Lights {
+    lights: Vec<Light>,
+    /// Running sum of the probabilities; the last is 1.
+    cumulative: Vec<f32>,
+    /// For every triangle its light, or `NONE`.
+    of_triangle: Vec<u32>,
+    /// For every distant light its light, or `NONE`.
+    of_distant: Vec<u32>,
+    /// Whether any light is left for rays to meet by chance alone.
+    gathered: bool,
+}
+
+const NONE: u32 = u32::MAX;
+
+#[derive(Clone, Copy)]
+enum Light {
+    Triangle { index: u32, area: f32, normal: Vec3, emission: Rgb },
+    Point(PointLight),
+    Distant(DistantLight),
+}
+
+/// Light from one direction.
+#[derive(Clone, Copy, Debug)]
+pub struct Arrival {
+    /// Unit direction towards the light.
+    pub direction: Vec3,
+    /// Where the shadow ray ends; `None`: never.
+    pub end: Option<Vec3>,
+    /// Radiance over density; for light without extent its irradiance on a facing surface over the chance of choosing it.
+    pub weight: Rgb,
+    /// Density by solid angle, 1/sr; `None` for light without extent, which no other ray can meet.
+    pub pdf: Option<f32>,
+}
+
+impl Lights {
+    /// Lists the lights of a scene. With `gather_broad`, broad ones are left to gathers; without, all are sampled.
+    pub fn new(world: &World, gather_broad: bool) -> Self {
+        let scene = &world.scene;
+        let sampled = sampled_materials(world, gather_broad);
+        let mut lights = Vec::new();
+        let mut powers = Vec::new();
+        let (mut of_triangle, mut of_distant) = (vec![NONE; scene.triangles.len()], vec![NONE; scene.distant.len()]);
+        let mut gathered = false;
+        let mut add = |light, power: f32| {
+            lights.push(light);
+            powers.push(f64::from(power));
+            lights.len() as u32 - 1
+        };
+        for (i, triangle) in scene.triangles.iter().enumerate() {
+            let emission = scene.materials[triangle.material as usize].emission;
+            let power = luminance(emission) * PI * area(&triangle.positions);
+            if power > 0.0 && sampled[triangle.material as usize] {
+                let area = area(&triangle.positions);
+                let light = Light::Triangle { index: i as u32, area, normal: facet(triangle), emission };
+                of_triangle[i] = add(light, power);
+            } else if power > 0.0 {
+                gathered = true;
+            }
+        }
+        for point in &scene.points {
+            add(Light::Point(*point), luminance(point.intensity) * 4.0 * PI);
+        }
+        for (i, distant) in scene.distant.iter().enumerate() {
+            let disc = PI * world.radius * world.radius;
+            let broad = distant.cos_half_angle < BROAD_COSINE || !distant.sampled;
+            if distant.is_beam() {
+                add(Light::Distant(*distant), luminance(distant.strength) * disc);
+            } else if gather_broad && broad {
+                gathered = true;
+            } else {
+                let solid_angle = 2.0 * PI * (1.0 - distant.cos_half_angle);
+                of_distant[i] = add(Light::Distant(*distant), luminance(distant.strength) * solid_angle * disc);
+            }
+        }
+        let total: f64 = powers.iter().sum();
+        let mut sum = 0.0;
+        let mut cumulative: Vec<f32> = powers
+            .iter()
+            .map(|p| {
+                sum += p;
+                (sum / total) as f32
+            })
+            .collect();
+        if let Some(last) = cumulative.last_mut() {
+            *last = 1.0;
+        }
+        Self { lights, cumulative, of_triangle, of_distant, gathered }
+    }
+
+    /// Whether rays can meet light that no shadow ray looks for.
+    pub fn any_gathered(&self) -> bool {
+        self.gathered
+    }
+
+    /// Whether shadow rays look for the light of a triangle.
+    pub fn samples_triangle(&self, triangle: u32) -> bool {
+        self.of_triangle[triangle as usize] != NONE
+    }
+
+    fn chance(&self, light: u32) -> f32 {
+        let before = if light == 0 { 0.0 } else { self.cumulative[light as usize - 1] };
+        self.cumulative[light as usize] - before
+    }
+
+    /// Density, by solid angle, of looking from `from` for the light of a triangle, where a ray along `direction` met it
+    /// at `distance`; 0 for light that is not sampled.
+    pub fn pdf_triangle(&self, world: &World, triangle: u32, from: Vec3, direction: Vec3, distance: f32) -> f32 {
+        let light = self.of_triangle[triangle as usize];
+        if light == NONE {
+            return 0.0;
+        }
+        let Light::Triangle { area, normal, .. } = self.lights[light as usize] else { return 0.0 };
+        let density = match SphericalTriangle::near(from, &world.scene.triangles[triangle as usize].positions) {
+            Some(near) => 1.0 / near.solid_angle,
+            None => distance * distance / (area * normal.dot(direction).abs()),
+        };
+        self.chance(light) * density
+    }
+
+    /// What a ray that meets nothing sees: for each distant light in that direction its radiance and its density, 0 for
+    /// light that is not sampled.
+    pub fn beyond<'a>(&'a self, world: &'a World, direction: Vec3) -> impl Iterator<Item = (Rgb, f32)> + 'a {
+        let seen = move |d: &DistantLight| !d.is_beam() && direction.dot(d.to_light) >= d.cos_half_angle;
+        world.scene.distant.iter().zip(&self.of_distant).filter(move |(d, _)| seen(d)).map(|(d, &light)| {
+            let pdf = if light == NONE { 0.0 } else { self.chance(light) / (2.0 * PI * (1.0 - d.cos_half_angle)) };
+            (d.strength, pdf)
+        })
+    }
+
+    /// Chooses a light and a point on it by `u` in [0, 1)³, as seen from `from`; `None` when it does not shine there.
+    pub fn sample(&self, world: &World, from: Vec3, u: [f32; 3]) -> Option<Arrival> {
+        let choice = self.cumulative.partition_point(|c| *c <= u[0]).min(self.lights.len().checked_sub(1)?);
+        let chance = self.chance(choice as u32);
+        match self.lights[choice] {
+            Light::Triangle { index, area, normal, emission } => {
+                let corners = &world.scene.triangles[index as usize].positions;
+                let (end, density) = point_on(corners, normal, area, from, [u[1], u[2]])?;
+                let (pdf, direction) = (chance * density, (end - from).normalize());
+                let end = world.off_front(index, end);
+                (pdf > 0.0 && pdf.is_finite() && end.is_finite()).then(|| Arrival {
+                    direction,
+                    end: Some(end),
+                    weight: emission / pdf,
+                    pdf: Some(pdf),
+                })
+            }
+            Light::Point(point) => {
+                let offset = point.position - from;
+                let (distance2, direction) = (offset.length_squared(), offset.try_normalize()?);
+                let falloff = point.spot.map_or(1.0, |spot| {
+                    let cosine = -direction.dot(spot.axis);
+                    let t = (cosine - spot.cos_outer) / (spot.cos_inner - spot.cos_outer).max(1e-4);
+                    let t = t.clamp(0.0, 1.0);
+                    t * t
+                });
+                let weight = point.intensity * (falloff / (distance2 * chance));
+                (falloff > 0.0).then_some(Arrival { direction, end: Some(point.position), weight, pdf: None })
+            }
+            Light::Distant(light) if light.is_beam() => {
+                Some(Arrival { direction: light.to_light, end: None, weight: light.strength / chance, pdf: None })
+            }
+            Light::Distant(light) => {
+                let z = 1.0 - u[1] * (1.0 - light.cos_half_angle);
+                let (sin_phi, cos_phi) = sin_cos(2.0 * PI * u[2]);
+                let s = (1.0 - z * z).max(0.0).sqrt();
+                let direction = Frame::around(light.to_light).to_world(Vec3::new(s * cos_phi, s * sin_phi, z));
+                let pdf = chance / (2.0 * PI * (1.0 - light.cos_half_angle));
+                Some(Arrival { direction, end: None, weight: light.strength / pdf, pdf: Some(pdf) })
+            }
+        }
+    }
+}
+
+/// A point on a lamp and its density by solid angle, as seen from its front side; `None` from behind.
+fn point_on(corners: &[Vec3; 3], normal: Vec3, area: f32, from: Vec3, [u, v]: [f32; 2]) -> Option<(Vec3, f32)> {
+    let height = normal.dot(corners[0] - from);
+    if height >= 0.0 {
+        return None;
+    }
+    if let Some(near) = SphericalTriangle::near(from, corners) {
+        let direction = near.sample(u, v);
+        return Some((from + direction * (height / normal.dot(direction)), 1.0 / near.solid_angle));
+    }
+    let s = u.sqrt();
+    let end = corners[0] * (1.0 - s) + corners[1] * (s * (1.0 - v)) + corners[2] * (s * v);
+    let offset = end - from;
+    let cosine = -normal.dot(offset) / offset.length();
+    Some((end, offset.length_squared() / (area * cosine)))
+}
+
+/// Which materials' light shadow rays look for.
+fn sampled_materials(world: &World, gather_broad: bool) -> Vec<bool> {
+    let scene = &world.scene;
+    if !gather_broad {
+        return vec![true; scene.materials.len()];
+    }
+    let mut areas = vec![0f64; scene.materials.len()];
+    for triangle in &scene.triangles {
+        areas[triangle.material as usize] += f64::from(area(&triangle.positions));
+    }
+    let total: f64 = areas.iter().sum();
+    let broad = |area: f64| area >= f64::from(BROAD) * total;
+    scene.materials.iter().zip(areas).map(|(m, area)| m.sampled && !broad(area)).collect()
+}
+
+fn area(corners: &[Vec3; 3]) -> f32 {
+    (corners[1] - corners[0]).cross(corners[2] - corners[0]).length() * 0.5
+}

@@ -1,0 +1,269 @@
+//! The second door: what a ray sees where it lands. Light emitted there, light from lamps, and indirect light: answered
+//! by the sealed records of that depth where they cover the point, else by following the path.
+//!
+//! Path tracing is this door without records: next-event estimation with multiple importance sampling (power heuristic,
+//! Veach 1997) and Russian roulette. It is unbiased and every method is measured against it.
+//!
+//! Depth counts surfaces from the camera: at depth 1 reflected light is direct light, at depth d its d - 1st bounce.
+
+use std::f32::consts::FRAC_1_PI;
+
+use cache_core::Query;
+use cache_core::hemisphere::{Sample, Strata};
+use cache_core::irradiance::Answer;
+use glam::{Vec2, Vec3};
+
+use crate::bsdf::{Bsdf, Part};
+use crate::frame::{Counts, Levels};
+use crate::lights::Lights;
+use crate::math::Frame;
+use crate::sampler::Sampler;
+use crate::scene::Rgb;
+use crate::world::{Meeting, World};
+
+/// Paths shorter than this many surfaces are never ended by Russian roulette.
+const SURE_DEPTH: u32 = 3;
+
+/// Chance at most with which Russian roulette lets a path go on: every path ends.
+const SURVIVAL_MAX: f32 = 0.95;
+
+/// All a ray needs to know.
+pub struct Tracer<'a> {
+    /// What there is to meet.
+    pub world: &'a World,
+    /// What there is to look for.
+    pub lights: &'a Lights,
+    /// The sealed records; empty for the path tracer.
+    pub levels: &'a Levels,
+    /// Indirect bounces to follow.
+    pub bounces: u32,
+    /// Whether diffuse light may be left to records: then beyond the last bounce there is none to look for by chance.
+    pub cached: bool,
+    /// Where no record covers what the camera sees, gather there and then with these cells; `None`: follow the path.
+    pub regather: Option<&'a Strata>,
+}
+
+/// What light a ray may bring back from lamps it meets by chance.
+#[derive(Clone, Copy, Debug)]
+pub enum Chance {
+    /// All: nobody looks for lamps where the ray comes from (camera, mirror).
+    All,
+    /// Only light that is gathered: the ray's origin has looked for the rest (gathers).
+    Gathered,
+    /// Gathered light wholly, sampled light by the power heuristic against this density of the ray.
+    Weighed(f32),
+}
+
+/// What a ray brought back. Radiance in W/(sr m²).
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Seen {
+    /// Light without bounce.
+    pub direct: Rgb,
+    /// Light with at least one bounce, and gathered light.
+    pub indirect: Rgb,
+    /// Irradiance records gave at the first surface, W/m².
+    pub irradiance: Rgb,
+    /// How many records gave it.
+    pub records: u32,
+    /// Distance of the first surface; infinite for none.
+    pub distance: f32,
+}
+
+impl Tracer<'_> {
+    /// Follows a ray whose first surface has depth `first`.
+    pub fn see(
+        &self,
+        (mut origin, mut direction): (Vec3, Vec3),
+        first: u32,
+        mut chance: Chance,
+        sampler: &mut Sampler,
+        counts: &mut Counts,
+    ) -> Seen {
+        let mut seen = Seen { distance: f32::INFINITY, ..Seen::default() };
+        let mut throughput = Rgb::ONE;
+        let mut depth = first;
+        loop {
+            counts.path_rays += 1;
+            let meeting = self.world.meet(origin, direction);
+            let emitted = match &meeting {
+                Some(at) => self.emitted(at, origin, direction, chance),
+                None => self.beyond(direction, chance),
+            };
+            seen.add(throughput * emitted, depth <= first + 1 && first == 1);
+            let Some(at) = meeting else { break };
+            if depth == first {
+                seen.distance = at.distance;
+            }
+            if depth - 1 > self.bounces {
+                break;
+            }
+            let Some(bsdf) = self.world.bsdf(&at) else { break };
+            let outgoing = at.frame.to_local(-direction);
+            let four = sampler.next4();
+            let part = match self.answer(&at, &bsdf, depth, sampler, counts) {
+                Some(answer) => {
+                    seen.indirect += throughput * bsdf.diffuse() * answer.irradiance * FRAC_1_PI;
+                    if depth == first {
+                        (seen.irradiance, seen.records) = (answer.irradiance, answer.records);
+                    }
+                    Part::Gloss
+                }
+                None => Part::All,
+            };
+            let lamps = self.lamps(&at, &bsdf, outgoing, part, [four[0], four[1], four[2]], counts);
+            seen.add(throughput * lamps, depth == 1);
+            let next = sampler.next4();
+            let Some(scatter) = bsdf.sample(outgoing, part, [next[0], next[1], next[2]]) else { break };
+            throughput *= scatter.weight;
+            let incoming = at.frame.to_world(scatter.incoming).normalize();
+            if incoming.dot(at.facet) <= 0.0 {
+                break;
+            }
+            if depth >= SURE_DEPTH {
+                let survival = throughput.abs().max_element().min(SURVIVAL_MAX);
+                if next[3] >= survival {
+                    break;
+                }
+                throughput /= survival;
+            }
+            chance = if scatter.pdf.is_finite() { Chance::Weighed(scatter.pdf) } else { Chance::All };
+            (origin, direction) = (at.leave(incoming), incoming);
+            depth += 1;
+        }
+        seen
+    }
+
+    /// Irradiance at a surface as far as records, or a small gather in their place, can tell it; `None`: follow the path.
+    fn answer(
+        &self,
+        at: &Meeting,
+        bsdf: &Bsdf,
+        depth: u32,
+        sampler: &mut Sampler,
+        counts: &mut Counts,
+    ) -> Option<Answer> {
+        if bsdf.diffuse() == Rgb::ZERO {
+            return None;
+        }
+        let Some(level) = self.levels.get(depth as usize - 1) else {
+            // The last bounce reflects lamps, which shadow rays find, and gathered light: without any, nothing is left.
+            let nothing_left = self.cached && depth - 1 == self.bounces && !self.lights.any_gathered();
+            return nothing_left.then(Answer::default);
+        };
+        counts.queries += 1;
+        let answer = level.ask(&Query { position: at.position, normal: at.normal() });
+        if answer.is_some() {
+            return answer;
+        }
+        counts.misses += 1;
+        self.regather.map(|strata| {
+            // Only what the camera sees is worth a gather of its own: its rays follow paths.
+            let tracer = Tracer { regather: None, ..*self };
+            let samples = tracer.hemisphere(at, at.frame, depth, strata, &mut sampler.branch(), counts);
+            Answer { irradiance: strata.estimate(&samples).irradiance, records: 0 }
+        })
+    }
+
+    /// What the rays of a gather bring back to a surface of `depth`, cell by cell of a hemisphere round `frame`.
+    pub fn hemisphere(
+        &self,
+        at: &Meeting,
+        frame: Frame,
+        depth: u32,
+        strata: &Strata,
+        sampler: &mut Sampler,
+        counts: &mut Counts,
+    ) -> Vec<Sample> {
+        let mut ray = |cell| {
+            let [u, v, ..] = sampler.next4();
+            let direction = frame.to_world(strata.direction(cell, Vec2::new(u, v))).normalize();
+            if direction.dot(at.facet) <= 0.0 {
+                // Below the facet of a smooth surface: the surface hides itself, at no distance worth counting.
+                return Sample { radiance: Rgb::ZERO, distance: f32::INFINITY };
+            }
+            let seen = self.see((at.leave(direction), direction), depth + 1, Chance::Gathered, sampler, counts);
+            Sample { radiance: seen.total().max(Rgb::ZERO), distance: seen.distance }
+        };
+        (0..strata.rays()).map(&mut ray).collect()
+    }
+
+    /// Reflected light of one lamp looked for by a shadow ray. `part` is what will be followed by chance as well.
+    fn lamps(&self, at: &Meeting, bsdf: &Bsdf, outgoing: Vec3, part: Part, u: [f32; 3], counts: &mut Counts) -> Rgb {
+        let Some(arrival) = self.lights.sample(self.world, at.position, u) else { return Rgb::ZERO };
+        let incoming = at.frame.to_local(arrival.direction);
+        if incoming.z <= 0.0 || arrival.direction.dot(at.facet) <= 0.0 {
+            return Rgb::ZERO;
+        }
+        let (diffuse, gloss) = bsdf.eval(outgoing, incoming);
+        let share = arrival.pdf.map_or(1.0, |pdf| heuristic(pdf, bsdf.pdf(outgoing, incoming, part)));
+        let reflected = match part {
+            Part::All => (diffuse + gloss) * share,
+            Part::Gloss if bsdf.has_gloss() => diffuse + gloss * share,
+            Part::Gloss => diffuse,
+        };
+        let light = reflected * arrival.weight * incoming.z;
+        if light == Rgb::ZERO {
+            return light;
+        }
+        counts.shadow_rays += 1;
+        let start = at.leave(arrival.direction);
+        let hidden = match arrival.end {
+            Some(end) => self.world.hidden(start, end),
+            None => self.world.shaded(start, arrival.direction),
+        };
+        if hidden { Rgb::ZERO } else { light }
+    }
+
+    fn emitted(&self, at: &Meeting, from: Vec3, direction: Vec3, chance: Chance) -> Rgb {
+        let emission = self.world.emission(at);
+        if emission == Rgb::ZERO {
+            return emission;
+        }
+        let sampled = self.lights.samples_triangle(at.triangle);
+        match chance {
+            Chance::All => emission,
+            Chance::Gathered => {
+                if sampled {
+                    Rgb::ZERO
+                } else {
+                    emission
+                }
+            }
+            Chance::Weighed(own) => {
+                emission
+                    * heuristic(own, self.lights.pdf_triangle(self.world, at.triangle, from, direction, at.distance))
+            }
+        }
+    }
+
+    fn beyond(&self, direction: Vec3, chance: Chance) -> Rgb {
+        let share = |pdf: f32| match chance {
+            Chance::All => 1.0,
+            Chance::Gathered => f32::from(pdf == 0.0),
+            Chance::Weighed(own) => heuristic(own, pdf),
+        };
+        self.lights.beyond(self.world, direction).map(|(radiance, pdf)| radiance * share(pdf)).sum()
+    }
+}
+
+impl Seen {
+    fn add(&mut self, light: Rgb, direct: bool) {
+        if direct {
+            self.direct += light;
+        } else {
+            self.indirect += light;
+        }
+    }
+
+    /// All light.
+    pub fn total(&self) -> Rgb {
+        self.direct + self.indirect
+    }
+}
+
+/// Power heuristic: share of a strategy of density `own` against one of density `other`.
+fn heuristic(own: f32, other: f32) -> f32 {
+    // By the ratio, so that squares cannot overflow.
+    let ratio = other / own;
+    1.0 / (1.0 + ratio * ratio)
+}
