@@ -147,3 +147,91 @@ impl Replica {
         all.into_iter().map(info).collect()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use cache_core::RecordId;
+    use glam::{Vec2, Vec3};
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const NAMESPACE: Namespace = Namespace([7; 32]);
+
+    fn record(id: u32, x: f32) -> Irradiance {
+        Irradiance {
+            id: RecordId(id.into()),
+            position: Vec3::X * x,
+            normal: Vec3::Z,
+            radius: 1.0,
+            radius_min: 0.1,
+            radius_max: 10.0,
+            irradiance: Vec3::ONE,
+            gradient_t: [Vec2::ZERO; 3],
+            gradient_r: [Vec2::ZERO; 3],
+        }
+    }
+
+    /// Reads batches from a position to the end into another replica.
+    fn follow(from: &Replica, position: &mut u64, to: &mut Replica) {
+        while let Some((count, batch)) = from.read(&NAMESPACE, *position).expect("not past the end") {
+            let (namespace, level, records) = convert::unpack(&batch).expect("sound");
+            assert_eq!(records.len() as u64, count);
+            to.insert(namespace, level, &records).expect("room");
+            *position += count;
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn a_follower_catches_up_and_agrees(
+            batches in prop::collection::vec((1..3u32, prop::collection::vec((0..40u32, 0..2u8), 0..20)), 0..12),
+        ) {
+            let (mut near, mut far) = (Replica::new(Limits::default()), Replica::new(Limits::default()));
+            let mut position = 0;
+            for (at, (level, records)) in batches.iter().enumerate() {
+                let records: Vec<_> = records.iter().map(|&(id, x)| record(id, x.into())).collect();
+                let before = near.mark(&NAMESPACE);
+                let added = near.insert(NAMESPACE, *level, &records).expect("room");
+                let after = near.mark(&NAMESPACE);
+                prop_assert_eq!((added.added, added.position), (after.records - before.records, after.position));
+                if at % 3 == 0 {
+                    follow(&near, &mut position, &mut far);
+                }
+            }
+            follow(&near, &mut position, &mut far);
+            let held = |r: &Replica| (r.mark(&NAMESPACE).records, r.mark(&NAMESPACE).digest);
+            prop_assert_eq!(held(&near), held(&far));
+            for level in 1..3 {
+                prop_assert_eq!(near.level(&NAMESPACE, level), far.level(&NAMESPACE, level));
+            }
+        }
+    }
+
+    #[test]
+    fn batches_hold_one_level_and_at_most_4096_records() {
+        let mut replica = Replica::new(Limits::default());
+        let records: Vec<_> = (0..5000).map(|id| record(id, 0.0)).collect();
+        replica.insert(NAMESPACE, 1, &records).expect("room");
+        replica.insert(NAMESPACE, 2, &[record(5000, 0.0)]).expect("room");
+        let count = |position| replica.read(&NAMESPACE, position).map(|read| read.map(|(count, b)| (count, b.level)));
+        assert_eq!(count(0).expect("there"), Some((4096, 1)));
+        assert_eq!(count(4096).expect("there"), Some((904, 1)));
+        assert_eq!(count(5000).expect("there"), Some((1, 2)));
+        assert_eq!(count(5001).expect("the end"), None);
+        let error = count(5002).expect_err("past the end").to_string();
+        assert!(error.contains("5002") && error.contains("5001"), "{error}");
+    }
+
+    #[test]
+    fn past_the_limits_nothing_of_a_batch_is_used() {
+        let mut replica = Replica::new(Limits { namespaces: 1, records: 3 });
+        replica.insert(NAMESPACE, 1, &[record(1, 0.0), record(2, 0.0)]).expect("room");
+        let full = replica.insert(NAMESPACE, 1, &[record(3, 0.0), record(4, 0.0)]);
+        assert!(full.expect_err("full").to_string().contains("at most 3"));
+        assert_eq!(replica.mark(&NAMESPACE).records, 2);
+        let full = replica.insert(Namespace([8; 32]), 1, &[record(3, 0.0)]);
+        assert!(full.expect_err("full").to_string().contains("namespaces"));
+        assert_eq!(replica.insert(Namespace([9; 32]), 1, &[]).expect("nothing"), Added::default());
+    }
+}
