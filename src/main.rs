@@ -1,1 +1,147 @@
-fn main() {}
+//! `ambience`: the one command users type. Here it is only wired: each subcommand has its room.
+//!
+//! - [`args`], [`render`], [`children`], [`progress`], [`stats`]: `render`.
+//! - [`compare`]: `compare`. `serve` and `worker` run the libraries `cache-server` and `worker`.
+//! - [`parent`]: children end with their parent. [`failure`]: exit codes.
+
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::error::ErrorKind;
+use clap::{Parser, Subcommand};
+
+mod args;
+mod children;
+mod compare;
+mod failure;
+mod parent;
+mod progress;
+mod render;
+mod stats;
+
+use failure::Failure;
+
+/// How long what runs on other threads may take to end after the command has.
+const GRACE: Duration = Duration::from_millis(200);
+
+/// A distributed cache of indirect light
+#[derive(Parser)]
+#[command(version, disable_help_subcommand = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Render a scene to OUT.exr, and OUT.png to look at
+    ///
+    /// Without --server, a server and workers are started on this machine and nothing is left running.
+    ///
+    /// OUT.exr holds linear RGB as R,G,B, the layers direct, indirect, irradiance and records, and header attributes
+    /// ambience:*. OUT.png is sRGB, exposed so that the 98th percentile of luminance shows at about 0.9.
+    ///
+    /// Exit codes: 0 done; 2 wrong usage or input; 1 everything else; 130 after Ctrl-C, 143 after SIGTERM.
+    Render(args::RenderArgs),
+    /// Keep and share records, and give out work
+    Serve {
+        #[command(flatten)]
+        serve: cache_server::ServeArgs,
+        #[command(flatten)]
+        owned: parent::OwnedArgs,
+    },
+    /// Render for a server until told to stop
+    Worker {
+        #[command(flatten)]
+        worker: worker::farm::WorkerArgs,
+        #[command(flatten)]
+        owned: parent::OwnedArgs,
+    },
+    /// Compare a picture with a reference
+    ///
+    /// Prints the relative RMSE (root mean squared difference of linear RGB over the mean of the reference), the bias
+    /// (mean over mean, minus 1) and the worst 8x8 block (difference of block means over the mean of the reference). The
+    /// larger picture is averaged to the size of the smaller.
+    Compare(compare::CompareArgs),
+}
+
+fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) if matches!(error.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion) => {
+            // A reader that closed the pipe early has seen enough.
+            drop(error.print());
+            return ExitCode::SUCCESS;
+        }
+        Err(error) => return end(Err(Failure::usage(one_line(&error.render().to_string())))),
+    };
+    end(match cli.command {
+        Command::Render(args) => block_on(render::run(args)),
+        Command::Serve { serve, owned } => {
+            owned.watch();
+            cache_server::cli::log_to_stderr();
+            block_on(async { cache_server::run(serve).await.map_err(serve_failure) })
+        }
+        Command::Worker { worker, owned } => {
+            owned.watch();
+            worker::farm::log_to_stderr();
+            worker::farm::block_on(worker).map_err(|e| Failure::failed(format!("{e:#}")))
+        }
+        Command::Compare(args) => compare::run(&args),
+    })
+}
+
+fn block_on(command: impl Future<Output = Result<(), Failure>>) -> Result<(), Failure> {
+    let runtime = tokio::runtime::Runtime::new().map_err(|e| Failure::failed(format!("cannot start: {e}")))?;
+    let ended = runtime.block_on(command);
+    runtime.shutdown_timeout(GRACE);
+    ended
+}
+
+fn serve_failure(error: cache_server::ServeError) -> Failure {
+    if error.exit_code() == 2 { Failure::usage(error) } else { Failure::failed(error) }
+}
+
+fn end(ended: Result<(), Failure>) -> ExitCode {
+    match ended {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            eprintln!("ambience: {failure}");
+            ExitCode::from(failure.exit_code())
+        }
+    }
+}
+
+/// The parser's complaint without its hints, as one line.
+fn one_line(text: &str) -> String {
+    let complaint = text.trim_start_matches("error: ").split("\n\n").next().unwrap_or(text);
+    complaint.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn complaint(line: &[&str]) -> String {
+        match Cli::try_parse_from(line) {
+            Ok(_) => panic!("{line:?} is not wrong"),
+            Err(e) => one_line(&e.render().to_string()),
+        }
+    }
+
+    #[test]
+    fn the_command_line_is_sound() {
+        use clap::CommandFactory as _;
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn complaints_are_one_line_that_says_what_and_where() {
+        let missing = complaint(&["ambience", "render", "a.glb"]);
+        assert_eq!(missing, "the following required arguments were not provided: --output <OUT.exr>");
+        let size = complaint(&["ambience", "render", "a.glb", "-o", "b.exr", "--size", "5"]);
+        assert!(size.starts_with("invalid value '5' for '--size <WxH>': expected WIDTHxHEIGHT"), "{size}");
+        let server = complaint(&["ambience", "worker", "--server", "nowhere"]);
+        assert!(server.contains("expected HOST:PORT or unix:PATH"), "{server}");
+    }
+}

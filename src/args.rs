@@ -1,0 +1,266 @@
+//! The arguments of `render`, their defaults, and what they mean for a given scene.
+
+use std::path::{Path, PathBuf};
+
+use worker::client::Address;
+use worker::scene::{self, Camera, Scene};
+use worker::settings::{ALL_BOUNCES, Method, Settings};
+use worker::{film, spec};
+
+use crate::children::Transport;
+use crate::failure::Failure;
+
+/// Every default of `render`.
+mod defaults {
+    /// Rows of the picture; its width follows from the camera.
+    pub const HEIGHT: u32 = 512;
+    pub const SPP: u32 = 16;
+    pub const METHOD: &str = "auto";
+    pub const A: f32 = 0.3;
+    pub const RAYS: u32 = 1024;
+    pub const BOUNCES: &str = "all";
+    pub const SEED: u64 = 0;
+    pub const THREADS: u16 = 1;
+}
+
+/// Renders a picture.
+#[derive(Clone, Debug, clap::Args)]
+pub struct RenderArgs {
+    /// Scene file: .glb, .gltf or .rad
+    pub scene: PathBuf,
+    /// Picture to write; a .png to look at is written beside it
+    #[arg(short, long, value_name = "OUT.exr")]
+    pub output: PathBuf,
+    /// Size in pixels [default: 512 high, as wide as the camera's aspect]. Another aspect than the camera's keeps the
+    /// vertical field of view
+    #[arg(long, value_name = "WxH", value_parser = size)]
+    pub size: Option<[u32; 2]>,
+    /// Camera of the scene by name, or a Radiance view file [default: the scene's first; SCENE.vf for SCENE.rad]
+    #[arg(long, value_name = "NAME | FILE.vf")]
+    pub camera: Option<String>,
+    /// Samples a pixel
+    #[arg(long, value_name = "N", default_value_t = defaults::SPP)]
+    pub spp: u32,
+    /// How indirect light is computed; auto is irradiance
+    #[arg(long, value_parser = ["auto", "irradiance", "path"], default_value = defaults::METHOD)]
+    pub method: String,
+    /// Allowed interpolation error of a record (Ward 1988): smaller is slower and more accurate
+    #[arg(long, value_name = "A", default_value_t = defaults::A)]
+    pub a: f32,
+    /// Rays in one gather
+    #[arg(long, value_name = "N", default_value_t = defaults::RAYS)]
+    pub rays: u32,
+    /// Indirect bounces: a number, or all
+    #[arg(long, value_name = "N", value_parser = bounces, default_value = defaults::BOUNCES)]
+    pub bounces: u32,
+    /// Another number gives another, equally good, picture
+    #[arg(long, value_name = "N", default_value_t = defaults::SEED)]
+    pub seed: u64,
+    /// Worker processes to start [default: one per core; with --server: none]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=1024))]
+    pub workers: Option<u16>,
+    /// Threads of each worker started here
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=64),
+          default_value_t = defaults::THREADS)]
+    pub threads: u16,
+    /// Use this server, and the workers connected to it: HOST:PORT or unix:PATH
+    #[arg(long, value_name = "ADDR")]
+    pub server: Option<Address>,
+    /// Write statistics as one JSON object
+    #[arg(long, value_name = "OUT.json")]
+    pub stats: Option<PathBuf>,
+    /// No progress and no closing line; warnings and errors only
+    #[arg(long)]
+    pub quiet: bool,
+    /// Not available yet
+    #[arg(long, value_name = "E")]
+    pub error: Option<String>,
+    /// Not available yet
+    #[arg(long, value_name = "DIR")]
+    pub cache: Option<PathBuf>,
+    /// How own workers reach their server.
+    #[arg(long, hide = true, value_enum, default_value_t)]
+    pub transport: Transport,
+}
+
+impl RenderArgs {
+    /// Checks everything that can be checked without the scene, the files to be written included.
+    ///
+    /// # Errors
+    /// [`Failure::Usage`].
+    pub fn check(&self) -> Result<(), Failure> {
+        for (given, name) in [(self.error.is_some(), "--error"), (self.cache.is_some(), "--cache")] {
+            if given {
+                return Err(Failure::usage(format!("{name} is not available yet")));
+            }
+        }
+        if self.server.is_none() && self.workers == Some(0) {
+            return Err(Failure::usage("--workers 0 needs --server: nobody would render"));
+        }
+        let ending = self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"));
+        if !ending {
+            return Err(Failure::usage(format!("--output {}: expected a name ending in .exr", self.output.display())));
+        }
+        for (path, option) in [(Some(&self.output), "--output"), (self.stats.as_ref(), "--stats")] {
+            if let Some(path) = path {
+                film::check_writable(path).map_err(|e| Failure::usage(format!("{option} {e}")))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// The PNG beside the EXR.
+    pub fn png(&self) -> PathBuf {
+        self.output.with_extension("png")
+    }
+
+    /// Worker processes to start.
+    pub fn workers(&self) -> u16 {
+        let default = || match self.server {
+            Some(_) => 0,
+            None => u16::try_from(worker::farm::cores()).unwrap_or(1024).min(1024),
+        };
+        self.workers.unwrap_or_else(default)
+    }
+
+    /// The settings for a scene.
+    ///
+    /// # Errors
+    /// [`Failure::Usage`]: no such camera, or a value outside its range.
+    pub fn settings(&self, scene: &Scene) -> Result<Settings, Failure> {
+        let camera = self.find_camera(scene)?;
+        let [width, height] = self.size.unwrap_or_else(|| {
+            let width = (defaults::HEIGHT as f32 * camera.aspect()).round().clamp(1.0, 65536.0);
+            [width as u32, defaults::HEIGHT]
+        });
+        let settings = Settings {
+            // The default size is the camera's own aspect but for rounding; what is inside the picture follows its size.
+            camera: camera.with_aspect(width as f32 / height as f32),
+            width,
+            height,
+            spp: self.spp,
+            method: Method::from_name(&self.method).unwrap_or(Method::Irradiance),
+            a: self.a,
+            rays: self.rays,
+            bounces: self.bounces,
+            seed: self.seed,
+        };
+        spec::check(&settings).map_err(|e| Failure::usage(format!("--{e}")))?;
+        Ok(settings)
+    }
+
+    fn find_camera(&self, scene: &Scene) -> Result<Camera, Failure> {
+        let view = |path: &Path| scene::load_view(path).map_err(Failure::usage);
+        if let Some(name) = &self.camera {
+            if Path::new(name).extension().is_some_and(|e| e.eq_ignore_ascii_case("vf")) {
+                return view(name.as_ref());
+            }
+            let named = scene.cameras.iter().find(|c| c.name == *name).cloned();
+            return named.ok_or_else(|| {
+                Failure::usage(format!("--camera {name}: {} has {}", self.scene.display(), cameras(scene)))
+            });
+        }
+        let beside = self.scene.with_extension("vf");
+        if self.scene.extension().is_some_and(|e| e.eq_ignore_ascii_case("rad")) && beside.is_file() {
+            return view(&beside);
+        }
+        scene.cameras.first().cloned().ok_or_else(|| {
+            let scene = self.scene.display();
+            Failure::usage(format!("{scene} has no camera: name a view file with --camera FILE.vf"))
+        })
+    }
+}
+
+/// The cameras there are, in words.
+fn cameras(scene: &Scene) -> String {
+    let names: Vec<_> = scene.cameras.iter().map(|c| format!("{:?}", c.name)).collect();
+    if names.is_empty() { "no cameras".into() } else { format!("the cameras {}", names.join(", ")) }
+}
+
+fn size(text: &str) -> Result<[u32; 2], String> {
+    let parsed = text.split_once(['x', 'X']).and_then(|(w, h)| Some([w.parse().ok()?, h.parse().ok()?]));
+    match parsed {
+        Some([w, h]) if (1..=65536).contains(&w) && (1..=65536).contains(&h) => Ok([w, h]),
+        _ => Err("expected WIDTHxHEIGHT in pixels, each 1 to 65536".into()),
+    }
+}
+
+fn bounces(text: &str) -> Result<u32, String> {
+    match text {
+        "all" => Ok(ALL_BOUNCES),
+        _ => text.parse().ok().filter(|n| *n < ALL_BOUNCES).ok_or_else(|| "expected a number or all".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+    use glam::Vec3;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        render: RenderArgs,
+    }
+
+    fn args(rest: &[&str]) -> RenderArgs {
+        let line = ["render", "scene.glb", "-o", "out.exr"].iter().chain(rest);
+        Line::try_parse_from(line).unwrap_or_else(|e| panic!("{e}")).render
+    }
+
+    fn scene() -> Scene {
+        let camera = |name: &str| Camera {
+            name: name.into(),
+            ..Camera::look(Vec3::ZERO, Vec3::Y, Vec3::Z, 1.0, 0.5, false).expect("view")
+        };
+        Scene { cameras: vec![camera("front"), camera("back")], ..Scene::default() }
+    }
+
+    fn usage(result: Result<impl std::fmt::Debug, Failure>) -> String {
+        let failure = result.expect_err("refused");
+        assert_eq!(failure.exit_code(), 2);
+        failure.to_string()
+    }
+
+    #[test]
+    fn defaults_are_those_of_the_help() {
+        let settings = args(&[]).settings(&scene()).expect("sound");
+        let expected = (libm::tanf(0.5) / libm::tanf(0.25) * 512.0).round() as u32;
+        assert_eq!((settings.width, settings.height, settings.spp), (expected, 512, 16));
+        assert_eq!((settings.method, settings.rays, settings.bounces), (Method::Irradiance, 1024, ALL_BOUNCES));
+        assert_eq!(settings.camera.name, "front");
+    }
+
+    #[test]
+    fn another_aspect_keeps_the_vertical_field_of_view() {
+        let settings = args(&["--size", "100x200", "--bounces", "3"]).settings(&scene()).expect("sound");
+        assert_eq!((settings.camera.up, settings.bounces), (scene().cameras[0].up, 3));
+        assert!((settings.camera.aspect() - 0.5).abs() < 1e-6);
+    }
+
+    #[test]
+    fn wrong_usage_says_what_and_where() {
+        let settings = |rest: &[&str]| usage(args(rest).settings(&scene()));
+        assert_eq!(settings(&["--camera", "top"]), "--camera top: scene.glb has the cameras \"front\", \"back\"");
+        assert_eq!(settings(&["--spp", "0"]), "--spp is 0, expected 1 to 65536");
+        assert_eq!(settings(&["--a", "nan"]), "--a is NaN, expected more than 0 and at most 10");
+        assert_eq!(settings(&["--rays", "3"]), "--rays is 3, expected 4 to 1048576");
+        let none = usage(args(&[]).settings(&Scene::default()));
+        assert_eq!(none, "scene.glb has no camera: name a view file with --camera FILE.vf");
+
+        let check = |rest: &[&str]| usage(args(rest).check());
+        assert_eq!(check(&["--error", "0.1"]), "--error is not available yet");
+        assert_eq!(check(&["--cache", "x"]), "--cache is not available yet");
+        assert!(check(&["--workers", "0"]).starts_with("--workers 0 needs --server"));
+        assert!(check(&["--stats", "/no/such/folder/s.json"]).starts_with("--stats /no/such/folder/s.json: cannot"));
+        let mut other = args(&[]);
+        other.output = "out.png".into();
+        assert_eq!(usage(other.check()), "--output out.png: expected a name ending in .exr");
+        for wrong in ["0x5", "5", "axb", "5x70000", "5x"] {
+            assert!(size(wrong).is_err());
+        }
+        assert!(bounces("-1").is_err() && bounces("some").is_err());
+    }
+}

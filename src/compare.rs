@@ -1,0 +1,51 @@
+//! `ambience compare`: how far a picture is from a reference.
+
+use std::path::PathBuf;
+
+use serde_json::json;
+use worker::{compare, film};
+
+use crate::failure::Failure;
+
+/// Arguments of `compare`.
+#[derive(Clone, Debug, clap::Args)]
+pub struct CompareArgs {
+    /// The picture
+    #[arg(value_name = "A.exr")]
+    pub picture: PathBuf,
+    /// The reference
+    #[arg(value_name = "B.exr")]
+    pub reference: PathBuf,
+    /// Print one JSON object: relative_rmse, bias, worst_block, worst_block_at [x, y], size [w, h]
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Compares and prints.
+///
+/// # Errors
+/// Pictures that cannot be read or compared.
+pub fn run(args: &CompareArgs) -> Result<(), Failure> {
+    let read = |path| film::read(path).map_err(Failure::usage);
+    let (picture, reference) = (read(&args.picture)?, read(&args.reference)?);
+    let found = compare::compare(&picture, &reference).map_err(|reason| {
+        Failure::usage(format!("{} against {}: {reason}", args.picture.display(), args.reference.display()))
+    })?;
+    let ((x, y), (width, height)) = (found.worst_at, found.size);
+    if args.json {
+        let object = json!({
+            "relative_rmse": found.relative_rmse,
+            "bias": found.bias,
+            "worst_block": found.worst_block,
+            "worst_block_at": [x, y],
+            "size": [width, height],
+        });
+        println!("{object}");
+    } else {
+        println!("size           {width}x{height}");
+        println!("relative RMSE  {:.5}", found.relative_rmse);
+        println!("bias           {:+.5}", found.bias);
+        println!("worst block    {:.5} at x {x}, y {y}", found.worst_block);
+    }
+    Ok(())
+}

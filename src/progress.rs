@@ -1,0 +1,170 @@
+//! Tells the user on stderr how far a render is: a bar in a terminal, a line every few seconds elsewhere.
+
+use std::time::{Duration, Instant};
+
+use cache_core::rounds::RANKS;
+use cache_proto::v1;
+use indicatif::{HumanDuration, ProgressBar, ProgressStyle};
+
+/// Between two lines where there is no terminal.
+const LINES: Duration = Duration::from_secs(5);
+
+/// An estimate from less than this would be a guess.
+const SHARE_MIN: f64 = 0.02;
+const TIME_MIN: Duration = Duration::from_secs(1);
+
+/// Steps of the bar.
+const BAR: u64 = 1000;
+
+enum Shown {
+    Bar(ProgressBar),
+    Lines(Option<Instant>),
+    Nothing,
+}
+
+/// What the user sees while waiting.
+pub struct Progress {
+    shown: Shown,
+    phase: String,
+    since: Instant,
+}
+
+impl Progress {
+    /// A bar if stderr is a terminal, else lines; nothing if `quiet`.
+    pub fn new(quiet: bool) -> Self {
+        let shown = if quiet {
+            Shown::Nothing
+        } else if console_is_terminal() {
+            let bar = ProgressBar::new(BAR);
+            let style = ProgressStyle::with_template("{msg} [{bar:24}] {percent:>3} %{prefix}");
+            bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+            Shown::Bar(bar)
+        } else {
+            Shown::Lines(None)
+        };
+        Self { shown, phase: String::new(), since: Instant::now() }
+    }
+
+    /// Shows a phase of which no share is known.
+    pub fn phase(&mut self, phase: &str) {
+        self.show(phase, phase.to_string(), 0.0);
+    }
+
+    /// Shows what the server said.
+    pub fn frame(&mut self, progress: &v1::FrameProgress) {
+        let Some(step) = &progress.step else { return };
+        let phase = phase_name(step);
+        if progress.workers == 0 {
+            return self.phase("waiting for workers");
+        }
+        let shown = match step.level {
+            0 => format!("pixels · {} records", progress.records),
+            level => format!("level {level} pass {} · {} records", step.pass + 1, progress.records),
+        };
+        self.show(&format!("{phase} {}", step.pass), shown, share(progress));
+    }
+
+    fn show(&mut self, phase: &str, text: String, share: f64) {
+        let now = Instant::now();
+        let new = self.phase != phase;
+        if new {
+            (self.phase, self.since) = (phase.into(), now);
+        }
+        let left = remaining(now - self.since, share);
+        match &mut self.shown {
+            Shown::Bar(bar) => {
+                bar.set_position((share * BAR as f64) as u64);
+                bar.set_prefix(left.map_or(String::new(), |l| format!(", {} left in this phase", HumanDuration(l))));
+                bar.set_message(text);
+            }
+            Shown::Lines(last) if last.is_none_or(|l| now - l >= LINES) => {
+                *last = Some(now);
+                let left = left.map_or(String::new(), |l| format!(", {} s left in this phase", l.as_secs()));
+                eprintln!("ambience: {text}, {:.0} %{left}", share * 100.0);
+            }
+            _ => {}
+        }
+    }
+
+    /// Prints a line that stays.
+    pub fn note(&self, line: &str) {
+        match &self.shown {
+            Shown::Bar(bar) => bar.suspend(|| eprintln!("ambience: {line}")),
+            _ => eprintln!("ambience: {line}"),
+        }
+    }
+
+    /// Prints a line that stays, unless quiet.
+    pub fn tell(&self, line: &str) {
+        if !matches!(self.shown, Shown::Nothing) {
+            self.note(line);
+        }
+    }
+
+    /// Removes the bar.
+    pub fn finish(&self) {
+        if let Shown::Bar(bar) = &self.shown {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+impl Drop for Progress {
+    fn drop(&mut self) {
+        self.finish();
+    }
+}
+
+fn console_is_terminal() -> bool {
+    std::io::IsTerminal::is_terminal(&std::io::stderr())
+}
+
+/// `level N` or `pixels`, as in the workers' counts.
+pub fn phase_name(step: &v1::Step) -> String {
+    match step.level {
+        0 => "pixels".into(),
+        level => format!("level {level}"),
+    }
+}
+
+/// How much of its phase (a pass over a level, or the pixels) is done, 0 to 1.
+fn share(progress: &v1::FrameProgress) -> f64 {
+    let Some(step) = &progress.step else { return 0.0 };
+    let tiles = f64::from(progress.tiles_done) / f64::from(progress.tiles_total.max(1));
+    match step.level {
+        0 => tiles,
+        _ => {
+            let (from, to) = (f64::from(step.rank_from), f64::from(step.rank_to));
+            (from + (to - from) * tiles) / f64::from(RANKS)
+        }
+    }
+}
+
+/// Time left if the rest goes as the part before; `None` when too little of it is done to tell.
+fn remaining(elapsed: Duration, share: f64) -> Option<Duration> {
+    let known = share >= SHARE_MIN && share <= 1.0 && elapsed >= TIME_MIN;
+    known.then(|| elapsed.mul_f64((1.0 - share) / share))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_share_counts_ranks_and_tiles() {
+        let step = v1::Step { level: 2, rank_from: RANKS / 2, rank_to: RANKS, ..Default::default() };
+        let progress = v1::FrameProgress { step: Some(step), tiles_done: 1, tiles_total: 4, ..Default::default() };
+        assert_eq!(share(&progress), 0.625);
+        let pixels = v1::FrameProgress { step: Some(v1::Step::default()), ..progress };
+        assert_eq!(share(&pixels), 0.25);
+    }
+
+    #[test]
+    fn time_left_is_only_told_when_something_is_known() {
+        let s = Duration::from_secs;
+        assert_eq!(remaining(s(10), 0.25), Some(s(30)));
+        assert_eq!(remaining(s(10), 1.0), Some(s(0)));
+        assert_eq!(remaining(s(10), 0.0), None);
+        assert_eq!(remaining(Duration::from_millis(10), 0.5), None);
+    }
+}

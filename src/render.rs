@@ -1,0 +1,398 @@
+//! `ambience render`: from a scene to a picture, with own processes or somebody's server.
+
+use std::collections::HashSet;
+use std::path::Path;
+use std::time::Duration;
+
+use cache_proto::v1::frame_event::Event as FrameEvent;
+use cache_proto::{VERSION, v1};
+use serde_json::{Map, Value, json};
+use tonic::{Status, Streaming};
+use worker::client::{self, Address, Frames};
+use worker::film::{self, Film};
+use worker::frame::Frame;
+use worker::scene::{self, Scene};
+use worker::settings::{ALL_BOUNCES, Settings};
+use worker::spec;
+use worker::world::World;
+
+use crate::args::RenderArgs;
+use crate::children::{Children, Event, how};
+use crate::failure::Failure;
+use crate::progress::{Progress, phase_name};
+use crate::stats::{Stats, hex};
+
+/// Own processes that died and are started again, all together.
+const RESTARTS: u32 = 3;
+
+/// How long the server may take to hear that a worker died; its leases run out a little later anyway.
+const LEAVE: Duration = Duration::from_secs(2);
+
+/// Rays across and down with which a black picture is examined.
+const PROBES: u32 = 24;
+
+/// Renders until done, failed, or ended by a signal; leaves no process and no partial file behind.
+///
+/// # Errors
+/// What went wrong, with the exit code it means.
+pub async fn run(args: RenderArgs) -> Result<(), Failure> {
+    args.check()?;
+    let mut children = Children::new()?;
+    let ended = tokio::select! {
+        biased;
+        number = signalled() => Err(Failure::Signal(number)),
+        ended = render(&args, &mut children) => ended,
+    };
+    children.stop().await;
+    ended
+}
+
+#[cfg(unix)]
+async fn signalled() -> u8 {
+    use tokio::signal::unix::{SignalKind, signal};
+    let wait = async |kind: SignalKind| {
+        match signal(kind) {
+            Ok(mut signal) => drop(signal.recv().await),
+            Err(_) => std::future::pending().await,
+        }
+        kind.as_raw_value() as u8
+    };
+    tokio::select! {
+        number = wait(SignalKind::interrupt()) => number,
+        number = wait(SignalKind::terminate()) => number,
+        number = wait(SignalKind::hangup()) => number,
+    }
+}
+
+#[cfg(not(unix))]
+async fn signalled() -> u8 {
+    if tokio::signal::ctrl_c().await.is_err() {
+        std::future::pending().await
+    }
+    2
+}
+
+async fn render(args: &RenderArgs, children: &mut Children) -> Result<(), Failure> {
+    let (mut stats, mut progress) = (Stats::default(), Progress::new(args.quiet));
+    stats.phase("load");
+    progress.phase("loading the scene");
+    let job = {
+        let args = args.clone();
+        let loading = tokio::task::spawn_blocking(move || load(&args));
+        loading.await.map_err(|e| Failure::failed(format!("loading the scene failed: {e}")))??
+    };
+    for warning in &job.warnings {
+        progress.note(&format!("warning: {warning}"));
+    }
+    let mut render = Render { args, children, stats, progress, spare: RESTARTS, declined: HashSet::new() };
+    let (film, done) = render.picture(&job).await?;
+    // Reaped first, so that their memory is in the statistics.
+    render.children.stop().await;
+    render.write(&job, film, &done).await
+}
+
+/// What is to be rendered.
+struct Job {
+    settings: Settings,
+    spec: v1::FrameSpec,
+    warnings: Vec<String>,
+}
+
+fn load(args: &RenderArgs) -> Result<Job, Failure> {
+    let scene = scene::load(&args.scene).map_err(Failure::usage)?;
+    let settings = args.settings(&scene)?;
+    let unreadable = |e: &dyn std::fmt::Display| Failure::usage(format!("{}: {e}", args.scene.display()));
+    let path = std::fs::canonicalize(&args.scene).map_err(|e| unreadable(&e))?;
+    let path =
+        path.to_str().ok_or_else(|| unreadable(&"the path is not UTF-8, workers could not be told"))?.to_string();
+    let mut warnings = scene.warnings.clone();
+    if !is_lit(&scene) {
+        warnings.push(format!("{} has no light: the picture will be black", args.scene.display()));
+    }
+    let hash = scene.hash;
+    // Only the renderer itself knows how many levels a scene needs.
+    let frame = Frame::new(scene, settings.clone());
+    Ok(Job { settings, spec: spec::message(&frame, &path, &hash), warnings })
+}
+
+fn is_lit(scene: &Scene) -> bool {
+    let emits = |t: &scene::Triangle| scene.materials[t.material as usize].emission.max_element() > 0.0;
+    scene.points.iter().any(|p| p.intensity.max_element() > 0.0)
+        || scene.distant.iter().any(|d| d.strength.max_element() > 0.0)
+        || scene.triangles.iter().any(emits)
+}
+
+/// How the attempt to render a frame ended.
+enum End {
+    Done(v1::FrameDone),
+    /// The connection broke; the frame was cancelled by that.
+    Broken(Status),
+    /// The own server died.
+    ServerDied(String),
+}
+
+struct Render<'a> {
+    args: &'a RenderArgs,
+    children: &'a mut Children,
+    stats: Stats,
+    progress: Progress,
+    /// Restarts left.
+    spare: u32,
+    /// Names of workers that cannot do the frame.
+    declined: HashSet<String>,
+}
+
+impl Render<'_> {
+    /// Renders the frame, from its beginning again whenever the server was lost: what depends on nothing but the scene
+    /// and the settings comes out the same.
+    async fn picture(&mut self, job: &Job) -> Result<(Film, v1::FrameDone), Failure> {
+        let mut server = self.start().await?;
+        loop {
+            let mut film = Film::new(&job.settings);
+            match self.attempt(job, &server, &mut film).await? {
+                End::Done(done) if film.missing() == 0 => return Ok((film, done)),
+                End::Done(_) => {
+                    return Err(Failure::failed(format!("the server forgot {} tiles", film.missing())));
+                }
+                End::Broken(status) => {
+                    let why = status.message();
+                    self.progress.note(&format!("warning: lost the server ({why}); starting the frame again"));
+                }
+                End::ServerDied(how) => {
+                    self.stats.servers_lost += 1;
+                    if self.spare == 0 {
+                        return Err(Failure::failed(format!("the server ended, {how}, and that too often")));
+                    }
+                    self.spare -= 1;
+                    self.progress.note(&format!("warning: the server ended, {how}; starting the frame again"));
+                    // The workers too: what they hold is of a log that no longer exists.
+                    self.children.stop().await;
+                    server = self.start().await?;
+                }
+            }
+        }
+    }
+
+    /// Starts what is to be started: the server's address.
+    async fn start(&mut self) -> Result<Address, Failure> {
+        self.stats.phase("start");
+        self.progress.phase("starting");
+        let server = match &self.args.server {
+            Some(server) => server.clone(),
+            None => self.children.start_server(self.args.transport).await?,
+        };
+        self.stats.workers = self.args.workers().into();
+        for _ in 0..self.args.workers() {
+            self.children.start_worker(&server, self.args.threads)?;
+        }
+        Ok(server)
+    }
+
+    async fn attempt(&mut self, job: &Job, server: &Address, film: &mut Film) -> Result<End, Failure> {
+        let frames = client::frames(client::connect(server));
+        let mut events = match self.open(job, server, &frames).await? {
+            Ok(events) => events,
+            Err(end) => return Ok(end),
+        };
+        loop {
+            let event = tokio::select! {
+                event = events.message() => event,
+                event = self.children.next() => match self.child(event, server, &frames).await? {
+                    Some(end) => return Ok(end),
+                    None => continue,
+                },
+            };
+            let event = match event {
+                Ok(Some(event)) => event.event,
+                Ok(None) => return Ok(End::Broken(Status::unavailable("it ended the stream"))),
+                Err(status) if client::is_passing(&status) => return Ok(End::Broken(status)),
+                Err(status) => return Err(Failure::failed(format!("server {server}: {}", status.message()))),
+            };
+            match event {
+                Some(FrameEvent::Progress(progress)) => {
+                    self.stats.phase(&progress.step.as_ref().map_or("start".into(), phase_name));
+                    self.progress.frame(&progress);
+                }
+                Some(FrameEvent::Tile(tile)) => {
+                    self.stats.tile_bytes += tile.pixels.len() as u64;
+                    film.add(tile.tile, &tile.pixels).map_err(Failure::failed)?;
+                }
+                Some(FrameEvent::Declined(declined)) => self.decline(declined)?,
+                Some(FrameEvent::Done(done)) => return Ok(End::Done(done)),
+                Some(FrameEvent::Opened(_)) | None => {}
+            }
+        }
+    }
+
+    async fn open(
+        &mut self,
+        job: &Job,
+        server: &Address,
+        frames: &Frames,
+    ) -> Result<Result<Streaming<v1::FrameEvent>, End>, Failure> {
+        let opening = client::retry(|| {
+            let request = v1::OpenRequest { spec: Some(job.spec.clone()), version: VERSION.into() };
+            let mut frames = frames.clone();
+            async move { frames.open(request).await }
+        });
+        tokio::pin!(opening);
+        loop {
+            tokio::select! {
+                opened = &mut opening => {
+                    let failed = |status: Status| Failure::failed(format!("server {server}: {}", status.message()));
+                    return opened.map(Ok).map_err(failed);
+                }
+                event = self.children.next() => if let Some(end) = self.child(event, server, frames).await? {
+                    return Ok(Err(end));
+                },
+            }
+        }
+    }
+
+    /// Reacts to what a child did.
+    async fn child(&mut self, event: Event, server: &Address, frames: &Frames) -> Result<Option<End>, Failure> {
+        match event {
+            Event::Line(title, line) => self.progress.note(&format!("{title}: {line}")),
+            Event::ServerEnded(status) => return Ok(Some(End::ServerDied(how(status)))),
+            Event::WorkerEnded { name, title, status } => {
+                self.stats.workers_lost += 1;
+                let request = v1::LeaveRequest { worker: name };
+                drop(tokio::time::timeout(LEAVE, frames.clone().leave(request)).await);
+                let again = self.spare > 0;
+                if again {
+                    self.spare -= 1;
+                    self.children.start_worker(server, self.args.threads)?;
+                }
+                let what = if again { "starting another" } else { "going on without it" };
+                self.progress.note(&format!("warning: {title} ended, {}; {what}", how(status)));
+                self.check_workers("they ended")?;
+            }
+        }
+        Ok(None)
+    }
+
+    fn decline(&mut self, declined: v1::FrameDeclined) -> Result<(), Failure> {
+        let v1::FrameDeclined { worker, reason } = declined;
+        self.progress.note(&format!("warning: worker {worker} cannot take part: {reason}"));
+        self.declined.insert(worker);
+        self.check_workers(&reason)
+    }
+
+    /// Fails when nobody is left who could render. With somebody's server, others may come.
+    fn check_workers(&self, why: &str) -> Result<(), Failure> {
+        let left = self.children.names().any(|name| !self.declined.contains(name));
+        if left || self.args.server.is_some() {
+            return Ok(());
+        }
+        Err(Failure::failed(format!("no worker is left to render: {why}")))
+    }
+
+    /// Puts picture and statistics on disk.
+    async fn write(&mut self, job: &Job, film: Film, done: &v1::FrameDone) -> Result<(), Failure> {
+        self.stats.phase("write");
+        self.progress.phase("writing");
+        let black = film.is_black();
+        let attributes = attributes(job, done);
+        let encoding = tokio::task::spawn_blocking(move || Ok((film.png()?, film.exr(&attributes)?)));
+        let encoded = encoding.await.map_err(Failure::failed)?;
+        let (png, exr) = encoded.map_err(|e: film::FilmError| Failure::failed(e))?;
+        let mut files = Vec::new();
+        // From here to the end nothing awaits, so no signal can come between the files.
+        for (path, bytes) in [(&self.args.png(), &png), (&self.args.output, &exr)] {
+            files.push(film::stage(path, bytes).map_err(Failure::failed)?);
+        }
+        self.progress.finish();
+        let seconds = self.stats.seconds();
+        if let Some(path) = &self.args.stats {
+            let json = std::mem::take(&mut self.stats).json(told(job), done);
+            let text = format!("{json:#}\n");
+            files.push(film::stage(path, text.as_bytes()).map_err(Failure::failed)?);
+        }
+        for file in files {
+            file.publish().map_err(Failure::failed)?;
+        }
+        if black {
+            self.progress.note(&format!("warning: the picture is black: {}", why_black(job)));
+        }
+        self.progress.finish();
+        if !self.args.quiet {
+            println!(
+                "{} and {}: {seconds:.1} s, {} records, {} rounds",
+                self.args.output.display(),
+                self.args.png().display(),
+                done.records,
+                done.rounds
+            );
+        }
+        Ok(())
+    }
+}
+
+/// Why a picture may be black.
+fn why_black(job: &Job) -> &'static str {
+    let Ok(scene) = scene::load(Path::new(&job.spec.scene)) else { return "the scene is gone" };
+    if !is_lit(&scene) {
+        return "the scene has no light";
+    }
+    let world = World::new(scene);
+    let (width, height) = (job.settings.width as f32, job.settings.height as f32);
+    let place = |i: u32, size: f32| (i as f32 + 0.5) / PROBES as f32 * size;
+    let sees = |i: u32| {
+        let (origin, direction) = job.settings.ray(place(i % PROBES, width), place(i / PROBES, height));
+        world.meet(origin, direction).is_some()
+    };
+    if (0..PROBES * PROBES).any(sees) { "no light reaches what the camera sees" } else { "the camera sees no surface" }
+}
+
+fn bounces(settings: &Settings) -> String {
+    if settings.bounces == ALL_BOUNCES { "all".into() } else { settings.bounces.to_string() }
+}
+
+/// What the header of the EXR says. Nothing of it may depend on who rendered.
+fn attributes(job: &Job, done: &v1::FrameDone) -> Vec<(&'static str, String)> {
+    let s = &job.settings;
+    let vector = |v: glam::Vec3| format!("{} {} {}", v.x, v.y, v.z);
+    vec![
+        ("version", VERSION.into()),
+        ("scene_hash", hex(&job.spec.scene_hash)),
+        ("namespace", hex(&job.spec.namespace)),
+        ("method", s.method.name().into()),
+        ("spp", s.spp.to_string()),
+        ("a", s.a.to_string()),
+        ("rays", s.rays.to_string()),
+        ("bounces", bounces(s)),
+        ("seed", s.seed.to_string()),
+        ("records", done.records.to_string()),
+        ("camera_eye", vector(s.camera.eye)),
+        ("camera_forward", vector(s.camera.forward)),
+        ("camera_right", vector(s.camera.right)),
+        ("camera_up", vector(s.camera.up)),
+        ("camera_parallel", s.camera.parallel.to_string()),
+    ]
+}
+
+/// What the statistics say about scene and settings.
+fn told(job: &Job) -> Map<String, Value> {
+    let s = &job.settings;
+    let told = json!({
+        "version": VERSION,
+        "scene": job.spec.scene,
+        "scene_hash": hex(&job.spec.scene_hash),
+        "namespace": hex(&job.spec.namespace),
+        "settings": {
+            "width": s.width,
+            "height": s.height,
+            "spp": s.spp,
+            "method": s.method.name(),
+            "a": s.a,
+            "rays": s.rays,
+            "bounces": bounces(s),
+            "seed": s.seed,
+            "levels": job.spec.levels,
+        },
+    });
+    match told {
+        Value::Object(map) => map,
+        _ => Map::new(),
+    }
+}
