@@ -47,7 +47,7 @@ impl Progress {
 
     /// Shows a phase of which no share is known.
     pub fn phase(&mut self, phase: &str) {
-        self.show(phase, phase.to_string(), 0.0);
+        self.show(phase, phase.to_string(), None);
     }
 
     /// Shows what the server said.
@@ -61,26 +61,27 @@ impl Progress {
             0 => format!("pixels · {} records", progress.records),
             level => format!("level {level} pass {} · {} records", step.pass + 1, progress.records),
         };
-        self.show(&format!("{phase} {}", step.pass), shown, share(progress));
+        self.show(&format!("{phase} {}", step.pass), shown, Some(share(progress)));
     }
 
-    fn show(&mut self, phase: &str, text: String, share: f64) {
+    fn show(&mut self, phase: &str, text: String, share: Option<f64>) {
         let now = Instant::now();
         let new = self.phase != phase;
         if new {
             (self.phase, self.since) = (phase.into(), now);
         }
-        let left = remaining(now - self.since, share);
+        let left = share.and_then(|share| remaining(now - self.since, share));
         match &mut self.shown {
             Shown::Bar(bar) => {
-                bar.set_position((share * BAR as f64) as u64);
+                bar.set_position((share.unwrap_or(0.0) * BAR as f64) as u64);
                 bar.set_prefix(left.map_or(String::new(), |l| format!(", {} left in this phase", HumanDuration(l))));
                 bar.set_message(text);
             }
             Shown::Lines(last) if last.is_none_or(|l| now - l >= LINES) => {
                 *last = Some(now);
                 let left = left.map_or(String::new(), |l| format!(", {} s left in this phase", l.as_secs()));
-                eprintln!("ambience: {text}, {:.0} %{left}", share * 100.0);
+                let share = share.map_or(String::new(), |s| format!(", {:.0} %", s * 100.0));
+                eprintln!("ambience: {text}{share}{left}");
             }
             _ => {}
         }
@@ -91,13 +92,6 @@ impl Progress {
         match &self.shown {
             Shown::Bar(bar) => bar.suspend(|| eprintln!("ambience: {line}")),
             _ => eprintln!("ambience: {line}"),
-        }
-    }
-
-    /// Prints a line that stays, unless quiet.
-    pub fn tell(&self, line: &str) {
-        if !matches!(self.shown, Shown::Nothing) {
-            self.note(line);
         }
     }
 

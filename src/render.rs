@@ -154,6 +154,8 @@ impl Render<'_> {
                 End::Done(_) => {
                     return Err(Failure::failed(format!("the server forgot {} tiles", film.missing())));
                 }
+                // If the own server died, we are about to hear it.
+                End::Broken(_) if self.args.server.is_none() => {}
                 End::Broken(status) => {
                     let why = status.message();
                     self.progress.note(&format!("warning: lost the server ({why}); starting the frame again"));
@@ -384,7 +386,8 @@ fn told(job: &Job) -> Map<String, Value> {
             "height": s.height,
             "spp": s.spp,
             "method": s.method.name(),
-            "a": s.a,
+            // As the user wrote it, not as its nearest double.
+            "a": s.a.to_string().parse::<f64>().unwrap_or(s.a.into()),
             "rays": s.rays,
             "bounces": bounces(s),
             "seed": s.seed,

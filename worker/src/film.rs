@@ -11,8 +11,8 @@ use std::io::{Cursor, Write as _};
 use std::path::{Path, PathBuf};
 
 use exr::prelude::{
-    AnyChannel, AnyChannels, AttributeValue, Compression, Encoding, FlatSamples, Image, Layer, LayerAttributes, Text,
-    Vec2, WritableImage as _,
+    AnyChannel, AnyChannels, AttributeValue, Blocks, Compression, Encoding, FlatSamples, Image, Layer, LayerAttributes,
+    LineOrder, Text, Vec2, WritableImage as _,
 };
 use tempfile::NamedTempFile;
 
@@ -164,8 +164,10 @@ impl Film {
             own.other.insert(text(&format!("ambience:{name}"))?, AttributeValue::Text(text(value)?));
         }
         let channels = NAMES.into_iter().zip(self.planes);
-        let channels = channels.map(|(name, plane)| AnyChannel::new(name, FlatSamples::F32(plane))).collect();
-        let encoding = Encoding { compression: Compression::ZIP16, ..Encoding::FAST_LOSSLESS };
+        let channels = channels.map(|(name, plane)| channel(name, plane)).collect();
+        // Any other order is the order in which threads happen to finish.
+        let line_order = LineOrder::Increasing;
+        let encoding = Encoding { compression: Compression::ZIP16, blocks: Blocks::ScanLines, line_order };
         let size = Vec2(self.settings.width as usize, self.settings.height as usize);
         let image = Image::from_layer(Layer::new(size, own, encoding, AnyChannels::sort(channels)));
         let mut bytes = Cursor::new(Vec::new());
@@ -174,6 +176,12 @@ impl Film {
         sort_header(&mut bytes).ok_or_else(|| FilmError::Encode("its header is not as expected".into()))?;
         Ok(bytes)
     }
+}
+
+fn channel(name: &str, plane: Vec<f32>) -> AnyChannel<FlatSamples> {
+    // The hint is for lossy compression of colours: false everywhere, where the encoder guesses by name.
+    let (quantize_linearly, sampling) = (false, Vec2(1, 1));
+    AnyChannel { name: name.into(), sample_data: FlatSamples::F32(plane), quantize_linearly, sampling }
 }
 
 /// Linear light to an 8-bit sRGB value.
@@ -304,9 +312,14 @@ mod tests {
     use super::*;
     use crate::spec::tests::sample;
 
+    /// Tall enough for many compressed blocks, which threads may finish in any order.
+    fn tall() -> Settings {
+        Settings { height: 900, ..sample() }
+    }
+
     /// A picture of every kind of bits: ordinary, tiny, huge, negative zero.
     fn film(order: impl Iterator<Item = u32>) -> Film {
-        let settings = sample();
+        let settings = tall();
         let mut film = Film::new(&settings);
         for tile in order {
             let [x0, x1, y0, y1] = settings.tile(tile);
@@ -327,7 +340,7 @@ mod tests {
 
     #[test]
     fn the_file_depends_on_the_pixels_alone_and_returns_their_bits() {
-        let tiles = sample().tiles();
+        let tiles = tall().tiles();
         let planes = film(0..tiles).planes;
         let file = film(0..tiles).exr(&attributes()).expect("encoded");
         for _ in 0..8 {
@@ -338,7 +351,7 @@ mod tests {
         let path = folder.path().join("a.exr");
         stage(&path, &file).expect("staged").publish().expect("published");
         let picture = read(&path).expect("read");
-        assert_eq!((picture.width, picture.height), (40, 20));
+        assert_eq!((picture.width, picture.height), (40, 900));
         for (i, rgb) in picture.rgb.iter().enumerate() {
             assert_eq!(rgb.map(f32::to_bits), [planes[0][i], planes[1][i], planes[2][i]].map(f32::to_bits));
         }
@@ -346,7 +359,7 @@ mod tests {
 
     #[test]
     fn every_layer_and_attribute_is_in_the_file() {
-        let file = film(0..sample().tiles()).exr(&attributes()).expect("encoded");
+        let file = film(0..tall().tiles()).exr(&attributes()).expect("encoded");
         use exr::prelude::{ReadChannels as _, ReadLayers as _};
         let reader = exr::prelude::read().no_deep_data().largest_resolution_level().all_channels().first_valid_layer();
         let layer = reader.all_attributes().from_buffered(Cursor::new(file)).expect("read").layer_data;
