@@ -13,6 +13,7 @@
 //! - [`trace`]: what a ray sees where it lands: the second door, and the path tracer.
 //! - [`gather`]: a record of irradiance is made.
 //! - [`frame`]: the two kinds of work a worker leases: filling rounds and making pixels.
+//! - [`solo`]: a frame without a farm.
 //! - [`math`]: functions whose bits are the same everywhere.
 
 pub mod scene;
@@ -31,5 +32,7 @@ pub mod trace;
 pub mod gather;
 
 pub mod frame;
+
+pub mod solo;
 
 pub mod math;
