@@ -13,7 +13,8 @@ use super::*;
 use crate::frame::UNDELIVERED_MAX;
 use crate::spec::tests::spec;
 
-const TILES: u32 = 7;
+/// Enough that leases are ranges of several tiles, cut and put back.
+const TILES: u32 = 23;
 
 /// What happens next; the numbers pick a worker, a lease, a time in ms.
 #[derive(Clone, Debug)]
