@@ -1,1 +1,46 @@
-//! x
+//! How records survive and spread, and how frames are filled in rounds.
+//!
+//! In the order of the flow, one sentence each:
+//!
+//! - [`refusal`]: what a peer can be refused for; every other room returns these.
+//! - [`journal`]: the door to durable storage: an insert is acknowledged only after it took the batch.
+//! - [`replica`]: the record sets of all namespaces, as logs that can be read by position; no I/O.
+//! - [`store`]: the replica shared between tasks, with its journal and the bell that tells of growth.
+//! - [`query`]: sealed levels kept ready to answer clients that hold no replica.
+//! - [`spec`]: what a frame asks for, checked once.
+//! - [`round`]: the tiles of one step: pending, leased or done; no I/O.
+//! - [`frame`]: one frame: its plan, its current round, and what its owner has still to be told; no I/O.
+//! - [`frames`]: all frames and workers: who gets which lease, and when it is lost; no I/O, time is passed in.
+//! - [`clock`]: the only place that asks what time it is.
+//! - [`bell`]: wakes every task that waits for a change.
+//! - [`cache_service`] and [`frames_service`]: the two gRPC services, thin over the rooms above.
+//! - [`listen`]: addresses, and the sockets bound to them.
+//! - [`serve`](mod@serve): health, reflection, shutdown.
+//! - [`cli`]: the arguments of `cache-server`, which `ambience serve` re-uses.
+
+pub mod refusal;
+
+pub mod journal;
+pub mod query;
+pub mod replica;
+pub mod store;
+
+pub mod frame;
+pub mod frames;
+pub mod round;
+pub mod spec;
+
+pub mod bell;
+pub mod clock;
+
+pub mod cache_service;
+pub mod frames_service;
+
+pub mod listen;
+pub mod serve;
+
+pub mod cli;
+
+pub use cli::{ServeArgs, run};
+pub use listen::{Bound, Listen, ServeError, bind};
+pub use serve::{Config, Node, serve, serve_on};

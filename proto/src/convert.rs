@@ -78,7 +78,8 @@ pub fn pack<'a, C: Cached>(
     level: u32,
     records: impl IntoIterator<Item = &'a C>,
 ) -> v1::RecordBatch {
-    let mut bytes = Vec::new();
+    let records = records.into_iter();
+    let mut bytes = Vec::with_capacity(records.size_hint().0 * C::BYTES);
     for record in records {
         record.encode(&mut bytes);
     }

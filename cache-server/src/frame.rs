@@ -1,0 +1,292 @@
+//! One frame: its plan, its current round, and what its owner has still to be told. No I/O; time is passed in.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::ops::Range;
+use std::sync::Arc;
+use std::time::Duration;
+
+use cache_core::rounds::Plan;
+use cache_proto::v1::frame_event::Event;
+use cache_proto::{convert, v1};
+
+use crate::refusal::Refusal;
+use crate::replica::Mark;
+use crate::round::{Held, Round};
+use crate::spec::{self, Job, PIXEL_BYTES_MAX};
+
+/// Most bytes of finished tiles that wait for the owner or are being made; past it no more pixels are leased.
+pub const UNDELIVERED_MAX: usize = 64 << 20;
+
+/// Most bytes of tiles one `Complete` brings, so that it fits a message; one tile always does.
+const COMPLETE_BYTES_MAX: usize = 4 << 20;
+
+/// A lease is this fraction of an equal share of what is pending: large at first, small near the end, so that all
+/// workers finish a step together (guided self-scheduling).
+const SHARES: u32 = 4;
+
+/// Most reasons of workers that wait for the owner; more are dropped, the first ones say enough.
+const DECLINES_MAX: usize = 64;
+
+/// Most bytes of a worker's reason; the rest is cut.
+const REASON_MAX: usize = 1024;
+
+/// Most distinct names of counts in one frame.
+const COUNTS_MAX: usize = 64;
+
+/// What an owner's stream does next.
+#[derive(Clone, PartialEq, Debug)]
+pub enum News {
+    /// Tells this.
+    Tell(Box<v1::FrameEvent>),
+    /// Waits.
+    Wait,
+    /// Ends: everything was told.
+    End,
+}
+
+/// One frame.
+#[derive(Debug)]
+pub struct Frame {
+    id: u64,
+    job: Job,
+    plan: Plan,
+    /// The step at work; `None` when all are done.
+    round: Option<Round>,
+    steps: u32,
+    fills: u32,
+    leases_lost: u32,
+    counts: BTreeMap<String, f64>,
+    unfit: BTreeSet<Arc<str>>,
+    outbox: Outbox,
+}
+
+/// What the owner has still to be told. Bounded: one opening, one progress, [`DECLINES_MAX`] reasons, about
+/// [`UNDELIVERED_MAX`] bytes of tiles, one end.
+#[derive(Debug, Default)]
+struct Outbox {
+    opening: bool,
+    progress: bool,
+    declined: VecDeque<v1::FrameDeclined>,
+    tiles: VecDeque<v1::FrameTile>,
+    tile_bytes: usize,
+    ended: bool,
+}
+
+impl Frame {
+    /// A frame whose first step reads the namespace as of `mark`.
+    pub fn new(id: u64, job: Job, mark: Mark) -> Self {
+        let mut frame = Self {
+            id,
+            plan: Plan::new(job.spec.levels),
+            job,
+            round: None,
+            steps: 0,
+            fills: 0,
+            leases_lost: 0,
+            counts: BTreeMap::new(),
+            unfit: BTreeSet::new(),
+            outbox: Outbox { opening: true, progress: true, ..Outbox::default() },
+        };
+        frame.advance(0, mark);
+        frame
+    }
+
+    /// What the frame asks for.
+    pub fn job(&self) -> &Job {
+        &self.job
+    }
+
+    /// The step at work; `None` when all are done.
+    pub fn round(&self) -> Option<&Round> {
+        self.round.as_ref()
+    }
+
+    /// Leases tiles to a worker, one of `workers`. `None` when there is nothing for it now.
+    pub fn lease(&mut self, lease: u64, worker: &Arc<str>, workers: u32, deadline: Duration) -> Option<v1::Lease> {
+        if self.unfit.contains(worker) {
+            return None;
+        }
+        let room = self.room();
+        let fit = workers.saturating_sub(self.unfit.len() as u32).max(1);
+        let round = self.round.as_mut()?;
+        let share = (round.pending_tiles() / fit.saturating_mul(SHARES)).max(1);
+        let tiles = (room > 0).then(|| round.grant(lease, worker.clone(), share.min(room), deadline))??;
+        let step = Some(round.step().clone());
+        Some(v1::Lease { id: lease, frame: self.id, step, tile_from: tiles.start, tile_to: tiles.end })
+    }
+
+    /// Most tiles one lease may have now: what the owner can still take, if they are pixels.
+    fn room(&self) -> u32 {
+        let Some(round) = self.round.as_ref().filter(|round| round.makes_pixels()) else { return u32::MAX };
+        let tile = self.job.tile_bytes_max();
+        let taken = self.outbox.tile_bytes.saturating_add(round.leased_tiles() as usize * tile);
+        let free = UNDELIVERED_MAX.saturating_sub(taken);
+        if free == 0 { 0 } else { (free.min(COMPLETE_BYTES_MAX) / tile).max(1) as u32 }
+    }
+
+    /// Moves the deadline of a worker's leases; returns their numbers.
+    pub fn renew(&mut self, worker: &str, deadline: Duration) -> Vec<u64> {
+        let Some(round) = &mut self.round else { return Vec::new() };
+        round.renew(worker, deadline);
+        round.held_by(worker).collect()
+    }
+
+    /// How many leases a worker holds.
+    pub fn held_by(&self, worker: &str) -> usize {
+        self.round.as_ref().map_or(0, |round| round.held_by(worker).count())
+    }
+
+    /// Ends a lease: false when `worker` does not hold it any more, and then nothing of the request is used. A step
+    /// that begins by this reads the namespace as of `mark`.
+    ///
+    /// # Errors
+    /// What is unsound about the request; the worker keeps the lease then.
+    pub fn complete(&mut self, request: v1::CompleteRequest, mark: impl FnOnce() -> Mark) -> Result<bool, Refusal> {
+        let Some(round) = &mut self.round else { return Ok(false) };
+        let Some(held) = round.held(request.lease, &request.worker) else { return Ok(false) };
+        let expected = if round.makes_pixels() { held.tiles.clone() } else { 0..0 };
+        check_gathered(request.gathered)?;
+        check_tiles(&self.job, expected, &request.tiles)?;
+        check_counts(&self.counts, &request.counts)?;
+
+        round.complete(request.lease, request.gathered);
+        for count in request.counts {
+            *self.counts.entry(count.name).or_default() += count.value;
+        }
+        self.outbox.progress = true;
+        self.outbox.tile_bytes += request.tiles.iter().map(|tile| tile.pixels.len()).sum::<usize>();
+        self.outbox.tiles.extend(request.tiles);
+        if round.is_over() {
+            let gathered = round.gathered();
+            self.advance(gathered, mark());
+        }
+        Ok(true)
+    }
+
+    fn advance(&mut self, gathered: u64, mark: Mark) {
+        self.round = self.plan.next(gathered).map(|step| {
+            let step = convert::step(self.steps, &step, mark.position, mark.digest);
+            Round::new(step, self.job.tiles)
+        });
+        if let Some(round) = &self.round {
+            self.steps += 1;
+            self.fills += u32::from(!round.makes_pixels());
+        }
+    }
+
+    /// Puts back the tiles of the leases that `lost` picks, and counts them as lost. Whether there were any.
+    pub fn lose(&mut self, lost: impl Fn(&Held) -> bool) -> bool {
+        let count = self.round.as_mut().map_or(0, |round| round.put_back(lost));
+        self.leases_lost += count;
+        count > 0
+    }
+
+    /// Gives a worker no more of this frame, and tells the owner why.
+    pub fn decline(&mut self, worker: Arc<str>, mut reason: String) {
+        if let Some(round) = &mut self.round {
+            round.put_back(|held| held.worker == worker);
+        }
+        let cut = (0..=REASON_MAX.min(reason.len())).rev().find(|&at| reason.is_char_boundary(at));
+        reason.truncate(cut.unwrap_or(0));
+        if self.outbox.declined.len() < DECLINES_MAX {
+            self.outbox.declined.push_back(v1::FrameDeclined { worker: worker.to_string(), reason });
+        }
+        self.unfit.insert(worker);
+    }
+
+    /// Forgets that a worker ever was.
+    pub fn forget(&mut self, worker: &str) {
+        self.unfit.remove(worker);
+    }
+
+    /// What the owner is told next; `mark` is the state of the frame's namespace. The second value is whether there
+    /// is room for pixels again where there was none.
+    pub fn news(&mut self, workers: u32, mark: impl FnOnce() -> Mark) -> (News, bool) {
+        let blocked = self.room() == 0;
+        let Some(event) = self.event(workers, mark) else {
+            return (if self.outbox.ended { News::End } else { News::Wait }, false);
+        };
+        (News::Tell(Box::new(v1::FrameEvent { event: Some(event) })), blocked && self.room() > 0)
+    }
+
+    fn event(&mut self, workers: u32, mark: impl FnOnce() -> Mark) -> Option<Event> {
+        let outbox = &mut self.outbox;
+        if std::mem::take(&mut outbox.opening) {
+            return Some(Event::Opened(v1::FrameOpened { frame: self.id }));
+        }
+        if let Some(declined) = outbox.declined.pop_front() {
+            return Some(Event::Declined(declined));
+        }
+        if let Some(round) = self.round.as_ref().filter(|_| outbox.progress) {
+            outbox.progress = false;
+            return Some(Event::Progress(v1::FrameProgress {
+                step: Some(round.step().clone()),
+                tiles_done: round.done_tiles(),
+                tiles_total: round.tiles(),
+                records: mark().records,
+                workers,
+            }));
+        }
+        if let Some(tile) = outbox.tiles.pop_front() {
+            outbox.tile_bytes -= tile.pixels.len();
+            return Some(Event::Tile(tile));
+        }
+        if self.round.is_some() || std::mem::replace(&mut outbox.ended, true) {
+            return None;
+        }
+        let mark = mark();
+        let count = |(name, value): (&String, &f64)| v1::Count { name: name.clone(), value: *value };
+        Some(Event::Done(v1::FrameDone {
+            rounds: self.fills,
+            leases_lost: self.leases_lost,
+            digest: convert::digest_bytes(mark.digest),
+            records: mark.records,
+            counts: self.counts.iter().map(count).collect(),
+        }))
+    }
+}
+
+/// So that no sum of them can overflow.
+fn check_gathered(gathered: u64) -> Result<(), Refusal> {
+    if gathered <= u64::from(u32::MAX) {
+        return Ok(());
+    }
+    Err(Refusal::field("gathered", format!("is {gathered}, expected at most {}", u32::MAX)))
+}
+
+fn check_tiles(job: &Job, expected: Range<u32>, tiles: &[v1::FrameTile]) -> Result<(), Refusal> {
+    let mut numbers: Vec<u32> = tiles.iter().map(|tile| tile.tile).collect();
+    numbers.sort_unstable();
+    if !numbers.iter().copied().eq(expected.clone()) {
+        let reason = format!("has {} tiles, expected each of {} to {} once", tiles.len(), expected.start, expected.end);
+        return Err(Refusal::field("tiles", reason));
+    }
+    for tile in tiles {
+        let (pixels, bytes) = (job.pixels(tile.tile), tile.pixels.len());
+        if bytes == 0 || !bytes.is_multiple_of(4 * pixels) || bytes > pixels * PIXEL_BYTES_MAX {
+            let reason = format!(
+                "tile {} has {bytes} bytes, expected a multiple of 4 bytes for each of its {pixels} pixels, at most 64",
+                tile.tile
+            );
+            return Err(Refusal::field("tiles", reason));
+        }
+    }
+    Ok(())
+}
+
+fn check_counts(known: &BTreeMap<String, f64>, counts: &[v1::Count]) -> Result<(), Refusal> {
+    let mut new = BTreeSet::new();
+    for count in counts {
+        spec::size("counts.name", count.name.len(), 1..=spec::NAME_MAX)?;
+        if !count.value.is_finite() {
+            return Err(Refusal::field("counts.value", format!("{} is {}", count.name, count.value)));
+        }
+        if !known.contains_key(&count.name) {
+            new.insert(&count.name);
+        }
+    }
+    if known.len() + new.len() > COUNTS_MAX {
+        return Err(Refusal::field("counts", format!("more than {COUNTS_MAX} different names in one frame")));
+    }
+    Ok(())
+}

@@ -1,0 +1,221 @@
+//! All frames and workers: who gets which lease, and when it is lost. No I/O; time and the state of the record sets are
+//! passed in, so that a test or a simulator decides both.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use cache_core::Namespace;
+use cache_proto::v1;
+
+use crate::frame::{Frame, News};
+use crate::refusal::Refusal;
+use crate::replica::Mark;
+use crate::spec::{self, Job};
+
+/// A lease that is neither completed nor renewed for this long is given to somebody else.
+pub const LEASE_TIME: Duration = Duration::from_secs(6);
+
+/// A worker not heard of for this long is forgotten. Longer than it may wait for a lease without a word.
+pub const WORKER_TIME: Duration = Duration::from_secs(15);
+
+/// Most frames open at once.
+pub const FRAMES_MAX: usize = 64;
+
+/// Most workers at once.
+pub const WORKERS_MAX: usize = 4096;
+
+/// Most leases one worker holds at once, over all frames.
+pub const LEASES_MAX: usize = 64;
+
+/// Who has to be woken after a change.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub struct Changes {
+    /// There may be work where there was none: workers that wait for a lease.
+    pub work: bool,
+    /// There may be something to tell: owners of frames.
+    pub news: bool,
+}
+
+/// Every open frame, and every worker heard of lately.
+#[derive(Debug)]
+pub struct Frames {
+    /// Oldest first, because numbers count up.
+    frames: BTreeMap<u64, Frame>,
+    /// When each worker was last heard of.
+    workers: BTreeMap<Arc<str>, Duration>,
+    next: u64,
+    changes: Changes,
+}
+
+impl Frames {
+    /// No frames yet; numbers of frames and leases count up from `first`. A server that restarts should begin
+    /// elsewhere, or a worker that lived on could complete a lease it was never given.
+    pub fn new(first: u64) -> Self {
+        Self { frames: BTreeMap::new(), workers: BTreeMap::new(), next: first, changes: Changes::default() }
+    }
+
+    /// Opens a frame; `mark` tells the state of a namespace. Returns the frame's number.
+    ///
+    /// # Errors
+    /// The field that is outside its range, or [`Refusal::Full`].
+    pub fn open(&mut self, spec: v1::FrameSpec, mark: impl FnOnce(&Namespace) -> Mark) -> Result<u64, Refusal> {
+        let job = Job::check(spec)?;
+        if self.frames.len() >= FRAMES_MAX {
+            return Err(Refusal::Full { what: "frames", most: FRAMES_MAX });
+        }
+        let (id, mark) = (self.number(), mark(&job.namespace));
+        self.frames.insert(id, Frame::new(id, job, mark));
+        self.changes = Changes { work: true, news: true };
+        Ok(id)
+    }
+
+    /// Cancels a frame or forgets a finished one: leases are revoked, memory is freed.
+    pub fn close(&mut self, frame: u64) {
+        self.frames.remove(&frame);
+    }
+
+    /// What to render.
+    ///
+    /// # Errors
+    /// [`Refusal::NoFrame`].
+    pub fn describe(&self, frame: u64) -> Result<&v1::FrameSpec, Refusal> {
+        self.frames.get(&frame).map(|frame| &frame.job().spec).ok_or(Refusal::NoFrame(frame))
+    }
+
+    /// Work for a worker, from the oldest frame that has some. `None`: nothing now, ask again after the next change.
+    ///
+    /// # Errors
+    /// [`Refusal::Full`] when there are too many workers, or this one holds too many leases.
+    pub fn lease(&mut self, worker: &str, now: Duration) -> Result<Option<v1::Lease>, Refusal> {
+        let worker = self.hear(worker, now)?;
+        if self.frames.values().map(|frame| frame.held_by(&worker)).sum::<usize>() >= LEASES_MAX {
+            return Err(Refusal::Full { what: "leases of one worker", most: LEASES_MAX });
+        }
+        let workers = self.workers.len() as u32;
+        let (number, deadline) = (self.number(), now + LEASE_TIME);
+        Ok(self.frames.values_mut().find_map(|frame| frame.lease(number, &worker, workers, deadline)))
+    }
+
+    /// A worker says that it lives: its leases get a new deadline. Returns the leases it still holds.
+    pub fn renew(&mut self, worker: &str, now: Duration) -> Vec<u64> {
+        if let Some(heard) = self.workers.get_mut(worker) {
+            *heard = now;
+        }
+        self.frames.values_mut().flat_map(|frame| frame.renew(worker, now + LEASE_TIME)).collect()
+    }
+
+    /// Ends a lease; `mark` tells the state of a namespace, for the step that may begin by this. False when the lease
+    /// was lost before, or completed: nothing of the request is used then.
+    ///
+    /// # Errors
+    /// What is unsound about the request; the worker keeps the lease then.
+    pub fn complete(
+        &mut self,
+        request: v1::CompleteRequest,
+        now: Duration,
+        mark: impl FnOnce(&Namespace) -> Mark,
+    ) -> Result<bool, Refusal> {
+        if let Some(heard) = self.workers.get_mut(request.worker.as_str()) {
+            *heard = now;
+        }
+        let Some(frame) = self.frames.get_mut(&request.frame) else { return Ok(false) };
+        let namespace = frame.job().namespace;
+        let step = frame.round().map(|round| round.step().index);
+        let accepted = frame.complete(request, || mark(&namespace))?;
+        self.changes.news |= accepted;
+        // A lease of pixels that brought less than the most a tile can have leaves room for others.
+        let pixels = frame.round().is_some_and(|round| round.makes_pixels());
+        self.changes.work |= accepted && (pixels || step != frame.round().map(|round| round.step().index));
+        Ok(accepted)
+    }
+
+    /// A worker cannot do a frame, and says why: it gets no more of it, the owner is told.
+    ///
+    /// # Errors
+    /// [`Refusal::NoFrame`], or [`Refusal::Full`] when there are too many workers.
+    pub fn decline(&mut self, worker: &str, frame: u64, reason: String, now: Duration) -> Result<(), Refusal> {
+        if !self.frames.contains_key(&frame) {
+            return Err(Refusal::NoFrame(frame));
+        }
+        let worker = self.hear(worker, now)?;
+        if let Some(frame) = self.frames.get_mut(&frame) {
+            frame.decline(worker, reason);
+        }
+        self.changes = Changes { work: true, news: true };
+        Ok(())
+    }
+
+    /// Gives back everything a worker holds, and forgets it.
+    pub fn leave(&mut self, worker: &str) {
+        if self.workers.remove(worker).is_none() {
+            return;
+        }
+        for frame in self.frames.values_mut() {
+            self.changes.work |= frame.lose(|held| &*held.worker == worker);
+            frame.forget(worker);
+        }
+    }
+
+    /// Takes back every lease whose deadline has come, and forgets workers that are silent. To be called a few times a
+    /// second; a lease holds until then.
+    pub fn tick(&mut self, now: Duration) {
+        for frame in self.frames.values_mut() {
+            self.changes.work |= frame.lose(|held| held.deadline <= now);
+        }
+        let frames = &mut self.frames;
+        self.workers.retain(|worker, heard| {
+            let silent = *heard + WORKER_TIME <= now;
+            if silent {
+                // Its leases are lost already: they end sooner than this.
+                frames.values_mut().for_each(|frame| frame.forget(worker));
+            }
+            !silent
+        });
+    }
+
+    /// What a frame's owner is told next; `mark` tells the state of a namespace.
+    pub fn news(&mut self, frame: u64, mark: impl FnOnce(&Namespace) -> Mark) -> News {
+        let workers = self.workers.len() as u32;
+        let Some(frame) = self.frames.get_mut(&frame) else { return News::End };
+        let namespace = frame.job().namespace;
+        let (news, room) = frame.news(workers, || mark(&namespace));
+        self.changes.work |= room;
+        news
+    }
+
+    /// Frames that are open.
+    pub fn frames(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// Workers heard of lately.
+    pub fn workers(&self) -> usize {
+        self.workers.len()
+    }
+
+    /// What changed since the last call.
+    pub fn take_changes(&mut self) -> Changes {
+        std::mem::take(&mut self.changes)
+    }
+
+    fn number(&mut self) -> u64 {
+        let number = self.next;
+        self.next += 1;
+        number
+    }
+
+    fn hear(&mut self, worker: &str, now: Duration) -> Result<Arc<str>, Refusal> {
+        spec::worker_name(worker)?;
+        if self.workers.len() >= WORKERS_MAX && !self.workers.contains_key(worker) {
+            return Err(Refusal::Full { what: "workers", most: WORKERS_MAX });
+        }
+        let name = self.workers.get_key_value(worker).map_or_else(|| Arc::from(worker), |(name, _)| name.clone());
+        self.workers.insert(name.clone(), now);
+        Ok(name)
+    }
+}
+
+#[cfg(test)]
+#[path = "frames_tests.rs"]
+mod tests;

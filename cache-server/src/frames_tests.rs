@@ -1,0 +1,369 @@
+//! Laws of the frames, whatever workers do: random interleavings of leasing, completing, dying, falling silent and
+//! completing too late.
+
+use std::cell::Cell;
+use std::collections::{BTreeMap, BTreeSet};
+
+use cache_core::rounds::{Plan, Step};
+use cache_proto::convert;
+use cache_proto::v1::frame_event::Event;
+use proptest::prelude::*;
+
+use super::*;
+use crate::frame::UNDELIVERED_MAX;
+use crate::spec::tests::spec;
+
+/// Enough that leases are ranges of several tiles, cut and put back.
+const TILES: u32 = 23;
+
+/// What happens next; the numbers pick a worker, a lease, a time in ms.
+#[derive(Clone, Debug)]
+enum Act {
+    Lease(u8),
+    Complete(usize),
+    CompleteLost(usize),
+    Renew(u8),
+    Leave(u8),
+    Pass(u64),
+    Listen,
+}
+
+fn acts() -> impl Strategy<Value = Vec<Act>> {
+    let act = prop_oneof![
+        8 => (0..4u8).prop_map(Act::Lease),
+        6 => any::<usize>().prop_map(Act::Complete),
+        2 => any::<usize>().prop_map(Act::CompleteLost),
+        1 => (0..4u8).prop_map(Act::Renew),
+        1 => (0..4u8).prop_map(Act::Leave),
+        2 => (0..4000u64).prop_map(Act::Pass),
+        2 => Just(Act::Listen),
+    ];
+    prop::collection::vec(act, 0..400)
+}
+
+/// What a tile gathers in a step: the same whoever does it. In the second pass one tile alone decides whether there is a
+/// third, so that no lease's count may be lost; then nothing, so that levels end.
+fn gathers(step: &v1::Step, tile: u32) -> u64 {
+    match (step.level, step.pass) {
+        (0, _) | (_, 2..) => 0,
+        (_, 1) => u64::from(step.rank_from == 0 && tile == TILES / 2),
+        _ => u64::from((step.index + tile) % 3),
+    }
+}
+
+/// The steps a frame must go through, and what each gathers.
+fn model(levels: u32) -> Vec<(Step, u64)> {
+    let (mut plan, mut all, mut last) = (Plan::new(levels), Vec::new(), 0);
+    while let Some(step) = plan.next(last) {
+        let wire = convert::step(all.len() as u32, &step, 0, Default::default());
+        last = (0..TILES).map(|tile| gathers(&wire, tile)).sum();
+        all.push((step, last));
+    }
+    all
+}
+
+struct Farm {
+    frames: Frames,
+    frame: u64,
+    now: Duration,
+    /// Length of the log: grows with every lease, so that a step's mark tells when it was taken.
+    log: Cell<u64>,
+    held: Vec<(String, v1::Lease)>,
+    lost: Vec<(String, v1::Lease)>,
+    /// Steps seen, by index, with the tiles done in each and what they gathered.
+    steps: BTreeMap<u32, (v1::Step, BTreeSet<u32>, u64)>,
+    tiles: BTreeSet<u32>,
+    losses: u32,
+    done: Option<v1::FrameDone>,
+}
+
+impl Farm {
+    fn new(levels: u32) -> Self {
+        let mut frames = Frames::new(1);
+        let frame = frames.open(spec(TILES, levels), |_| Mark::default()).expect("sound");
+        Self {
+            frames,
+            frame,
+            now: Duration::ZERO,
+            log: Cell::new(0),
+            held: vec![],
+            lost: vec![],
+            steps: BTreeMap::new(),
+            tiles: BTreeSet::new(),
+            losses: 0,
+            done: None,
+        }
+    }
+
+    fn act(&mut self, act: &Act) {
+        let name = |w: &u8| format!("worker {w}");
+        match act {
+            Act::Lease(w) => drop(self.lease(&name(w))),
+            Act::Complete(i) if !self.held.is_empty() => {
+                let (worker, lease) = self.held.swap_remove(i % self.held.len());
+                assert!(self.complete(&worker, &lease), "a lease that is held is accepted");
+                assert!(!self.complete(&worker, &lease), "only once");
+            }
+            Act::CompleteLost(i) if !self.lost.is_empty() => {
+                let (worker, lease) = self.lost[i % self.lost.len()].clone();
+                assert!(!self.complete(&worker, &lease), "a lost lease is not accepted");
+            }
+            Act::Renew(w) => {
+                let mut kept = self.frames.renew(&name(w), self.now);
+                kept.sort_unstable();
+                let mut held: Vec<_> = self.held.iter().filter(|h| h.0 == name(w)).map(|h| h.1.id).collect();
+                held.sort_unstable();
+                assert_eq!(kept, held);
+            }
+            Act::Leave(w) => {
+                self.frames.leave(&name(w));
+                self.lose(|worker, _| worker == name(w));
+            }
+            Act::Pass(ms) => {
+                self.now += Duration::from_millis(*ms);
+                let before: BTreeSet<u64> = self.kept();
+                self.frames.tick(self.now);
+                let after = self.kept();
+                assert!(after.is_subset(&before));
+                self.lose(|_, lease| !after.contains(&lease));
+            }
+            Act::Listen => self.listen(),
+            Act::Complete(_) | Act::CompleteLost(_) => (),
+        }
+    }
+
+    /// Leases the frames think are held.
+    fn kept(&self) -> BTreeSet<u64> {
+        let round = self.frames.frames[&self.frame].round();
+        let held = |w| round.map_or(vec![], |round| round.held_by(&format!("worker {w}")).collect());
+        (0..4).flat_map(held).collect()
+    }
+
+    fn lose(&mut self, lost: impl Fn(&str, u64) -> bool) {
+        let (lost, held): (Vec<_>, Vec<_>) = self.held.drain(..).partition(|(worker, lease)| lost(worker, lease.id));
+        self.losses += lost.len() as u32;
+        self.held = held;
+        self.lost.extend(lost);
+    }
+
+    fn lease(&mut self, worker: &str) -> bool {
+        let Some(lease) = self.frames.lease(worker, self.now).expect("room") else { return false };
+        self.log.set(self.log.get() + 1);
+        let step = lease.step.clone().expect("a step");
+        assert!(lease.tile_from < lease.tile_to && lease.tile_to <= TILES);
+        for index in 0..step.index {
+            assert_eq!(self.steps[&index].1.len(), TILES as usize, "step {index} is complete before {}", step.index);
+        }
+        let seen = self.steps.entry(step.index).or_insert_with(|| (step.clone(), BTreeSet::new(), 0));
+        assert_eq!(seen.0, step, "every lease of a step is told the same");
+        self.held.push((worker.into(), lease));
+        true
+    }
+
+    fn complete(&mut self, worker: &str, lease: &v1::Lease) -> bool {
+        let step = lease.step.clone().expect("a step");
+        let tiles = lease.tile_from..lease.tile_to;
+        let pixels = |tile| v1::FrameTile { tile, pixels: vec![0; 4 * 4 * 3].into() };
+        let gathered = tiles.clone().map(|tile| gathers(&step, tile)).sum();
+        let request = v1::CompleteRequest {
+            worker: worker.into(),
+            lease: lease.id,
+            frame: lease.frame,
+            gathered,
+            tiles: if step.level == 0 { tiles.clone().map(pixels).collect() } else { vec![] },
+            counts: vec![v1::Count { name: "rays".into(), value: tiles.len() as f64 }],
+        };
+        let position = self.log.get();
+        let mark = |_: &Namespace| Mark { position, ..Mark::default() };
+        let accepted = self.frames.complete(request, self.now, mark).expect("sound");
+        if accepted {
+            let seen = self.steps.get_mut(&step.index).expect("leased before");
+            assert!(tiles.into_iter().all(|tile| seen.1.insert(tile)), "each tile is done once");
+            seen.2 += gathered;
+            let round = self.frames.frames[&self.frame].round().filter(|round| round.step().index == step.index);
+            assert!(round.is_none_or(|round| round.gathered() == seen.2), "only what was accepted counts");
+        }
+        accepted
+    }
+
+    fn listen(&mut self) {
+        while let News::Tell(event) = self.frames.news(self.frame, |_| Mark::default()) {
+            assert!(self.done.is_none(), "nothing is told after the end");
+            match event.event.expect("an event") {
+                Event::Tile(tile) => assert!(self.tiles.insert(tile.tile), "each tile is delivered once"),
+                Event::Done(done) => self.done = Some(done),
+                _ => (),
+            }
+        }
+    }
+
+    /// The workers left behave, and the frame ends.
+    fn finish(&mut self) {
+        self.act(&Act::Pass(7000));
+        while self.lease("worker 0") {
+            self.act(&Act::Complete(0));
+        }
+        self.listen();
+    }
+}
+
+proptest! {
+    #[test]
+    fn the_farm_does_not_change_the_frame(acts in acts(), levels in 0..3u32) {
+        let mut farm = Farm::new(levels);
+        for act in &acts {
+            farm.act(act);
+        }
+        farm.finish();
+
+        let done = farm.done.clone().expect("the frame ended");
+        let steps: Vec<_> = farm.steps.values().map(|(step, _, gathered)| (convert::plan_step(step), *gathered)).collect();
+        prop_assert_eq!(&steps, &model(levels), "same steps, same sums");
+        prop_assert!(farm.steps.values().all(|(_, tiles, _)| tiles.len() == TILES as usize));
+        prop_assert_eq!(farm.tiles.len(), TILES as usize);
+        prop_assert_eq!(done.leases_lost, farm.losses);
+        prop_assert_eq!(done.rounds as usize, steps.len() - 1);
+        prop_assert_eq!(done.counts, vec![v1::Count { name: "rays".into(), value: (steps.len() as u32 * TILES).into() }]);
+        let sealed: Vec<_> = farm.steps.values().map(|(step, ..)| step.sealed_position).collect();
+        prop_assert!(sealed.is_sorted(), "each step reads what the one before left");
+    }
+}
+
+fn lease(frames: &mut Frames, worker: &str, seconds: u64) -> Option<v1::Lease> {
+    frames.lease(worker, Duration::from_secs(seconds)).expect("room")
+}
+
+fn open(frames: &mut Frames, tiles: u32, levels: u32) -> u64 {
+    frames.open(spec(tiles, levels), |_| Mark::default()).expect("sound")
+}
+
+fn complete(frames: &mut Frames, worker: &str, lease: &v1::Lease, bytes: usize) -> Result<bool, Refusal> {
+    let tile = |tile| v1::FrameTile { tile, pixels: vec![0; bytes].into() };
+    let request = v1::CompleteRequest {
+        worker: worker.into(),
+        lease: lease.id,
+        frame: lease.frame,
+        tiles: (lease.tile_from..lease.tile_to).map(tile).collect(),
+        ..Default::default()
+    };
+    frames.complete(request, Duration::ZERO, |_| Mark::default())
+}
+
+#[test]
+fn leases_shrink_as_work_runs_out_and_lost_tiles_are_given_first() {
+    let mut frames = Frames::new(1);
+    open(&mut frames, 64, 0);
+    let range = |lease: Option<v1::Lease>| lease.map(|l| l.tile_from..l.tile_to);
+    assert_eq!(range(lease(&mut frames, "a", 0)), Some(0..16));
+    assert_eq!(range(lease(&mut frames, "b", 0)), Some(16..22));
+    frames.leave("a");
+    assert!(frames.take_changes().work);
+    assert_eq!(range(lease(&mut frames, "b", 0)), Some(0..14));
+    assert_eq!(range(lease(&mut frames, "b", 0)), Some(14..16));
+}
+
+#[test]
+fn a_lease_lives_six_seconds_from_its_last_renewal() {
+    let mut frames = Frames::new(1);
+    open(&mut frames, 1, 0);
+    let first = lease(&mut frames, "a", 0).expect("work");
+    assert_eq!(frames.renew("a", Duration::from_secs(5)), [first.id]);
+    frames.tick(Duration::from_secs(10));
+    assert_eq!(lease(&mut frames, "b", 10), None);
+    frames.tick(Duration::from_secs(11));
+    assert_eq!(frames.renew("a", Duration::from_secs(11)), []);
+    assert!(lease(&mut frames, "b", 11).is_some());
+    assert_eq!(frames.workers(), 2);
+    frames.tick(Duration::from_secs(26));
+    assert_eq!(frames.workers(), 0);
+}
+
+#[test]
+fn older_frames_come_first_and_a_worker_that_declined_gets_the_next() {
+    let mut frames = Frames::new(1);
+    let (old, new) = (open(&mut frames, 4, 0), open(&mut frames, 4, 0));
+    assert_eq!(lease(&mut frames, "a", 0).expect("work").frame, old);
+    frames.decline("a", old, "no such file".repeat(1000), Duration::ZERO).expect("told");
+    assert_eq!(lease(&mut frames, "a", 0).expect("work").frame, new);
+    assert_eq!(lease(&mut frames, "b", 0).map(|l| (l.frame, l.tile_from)), Some((old, 0)));
+    let mut declined = None;
+    while let News::Tell(event) = frames.news(old, |_| Mark::default()) {
+        if let Some(Event::Declined(d)) = event.event {
+            declined = Some(d);
+        }
+    }
+    let declined = declined.expect("told");
+    assert_eq!((declined.worker.as_str(), declined.reason.len()), ("a", 1024));
+
+    frames.close(old);
+    assert!(matches!(frames.describe(old), Err(Refusal::NoFrame(_))));
+    assert_eq!(frames.renew("b", Duration::ZERO), []);
+}
+
+#[test]
+fn pixels_wait_for_an_owner_that_does_not_read() {
+    let mut frames = Frames::new(1);
+    let big = v1::FrameSpec { width: 256 * 64, height: 256, tile_size: 256, ..spec(1, 0) };
+    let frame = frames.open(big, |_| Mark::default()).expect("sound");
+    let bytes = 256 * 256 * 64;
+    let mut done = 0;
+    while let Some(work) = lease(&mut frames, "a", 0) {
+        assert_eq!(work.tile_to - work.tile_from, 1, "one tile fills a message");
+        assert!(complete(&mut frames, "a", &work, bytes).expect("sound"));
+        done += 1;
+    }
+    assert_eq!(done, UNDELIVERED_MAX / bytes);
+    frames.take_changes();
+    while !frames.take_changes().work {
+        assert!(matches!(frames.news(frame, |_| Mark::default()), News::Tell(_)));
+    }
+    assert!(lease(&mut frames, "a", 0).is_some());
+}
+
+#[test]
+fn what_a_worker_says_wrong_is_named_and_its_lease_stays() {
+    let mut frames = Frames::new(1);
+    open(&mut frames, 8, 0);
+    let work = lease(&mut frames, "a", 0).expect("work");
+    let named = |result: Result<bool, Refusal>, field: &str| {
+        let message = result.expect_err(field).to_string();
+        assert!(message.starts_with(field), "{message}");
+    };
+    let none = v1::Lease { tile_to: work.tile_from, ..work.clone() };
+    named(complete(&mut frames, "a", &none, 48), "tiles: has 0");
+    named(complete(&mut frames, "a", &work, 49), "tiles: tile 0 has 49");
+    named(complete(&mut frames, "a", &work, 0), "tiles: tile 0 has 0");
+    named(complete(&mut frames, "a", &work, 12 * 68), "tiles: tile 0 has 816");
+    let saying = |gathered, name: &str, value| v1::CompleteRequest {
+        worker: "a".into(),
+        lease: work.id,
+        frame: work.frame,
+        gathered,
+        tiles: (work.tile_from..work.tile_to).map(|tile| v1::FrameTile { tile, pixels: vec![0; 48].into() }).collect(),
+        counts: vec![v1::Count { name: name.into(), value }],
+    };
+    let mut say = |request| frames.complete(request, Duration::ZERO, |_| Mark::default());
+    named(say(saying(u64::MAX, "rays", 1.0)), "gathered");
+    named(say(saying(0, "rays", f64::NAN)), "counts.value");
+    named(say(saying(0, &"x".repeat(65), 1.0)), "counts.name");
+    assert!(!say(v1::CompleteRequest { worker: "b".into(), ..saying(0, "rays", 1.0) }).expect("not b's"));
+    assert!(say(saying(0, "rays", 1.0)).expect("sound"));
+}
+
+#[test]
+fn lists_are_bounded() {
+    let mut frames = Frames::new(1);
+    for _ in 0..FRAMES_MAX {
+        open(&mut frames, 4000, 0);
+    }
+    assert!(matches!(frames.open(spec(1, 0), |_| Mark::default()), Err(Refusal::Full { what: "frames", .. })));
+    for worker in 0..WORKERS_MAX {
+        lease(&mut frames, &worker.to_string(), 0);
+    }
+    assert!(matches!(frames.lease("one more", Duration::ZERO), Err(Refusal::Full { what: "workers", .. })));
+    for _ in 1..LEASES_MAX {
+        assert!(lease(&mut frames, "0", 0).is_some());
+    }
+    assert!(matches!(frames.lease("0", Duration::ZERO), Err(Refusal::Full { .. })));
+    assert!(matches!(frames.lease(&"x".repeat(65), Duration::ZERO), Err(Refusal::Field { .. })));
+}

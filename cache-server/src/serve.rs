@@ -1,0 +1,190 @@
+//! The server itself: services, health, reflection, shutdown. The transport is a seam: [`serve`] feeds it sockets,
+//! a simulator feeds [`serve_on`] whatever it likes.
+
+use std::convert::Infallible;
+use std::future::Future;
+use std::hash::{BuildHasher as _, Hasher as _, RandomState};
+use std::io;
+use std::sync::Arc;
+use std::time::Duration;
+
+use cache_proto::v1::cache_server::CacheServer;
+use cache_proto::v1::frames_server::FramesServer;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+use tokio_stream::Stream;
+use tokio_stream::wrappers::UnixListenerStream;
+use tonic::transport::Server;
+use tonic::transport::server::{Connected, TcpIncoming};
+
+use crate::cache_service::CacheService;
+use crate::clock::Clock;
+use crate::frames_service::{Board, FramesService};
+use crate::journal::{Journal, Nowhere};
+use crate::listen::{Bound, ServeError, Socket};
+use crate::replica::Limits;
+use crate::store::Store;
+
+/// How often lost leases are looked for.
+const TICK: Duration = Duration::from_millis(250);
+
+/// A client that does not answer a ping, sent after this long without a word, for as long again, is gone.
+const KEEPALIVE: Duration = Duration::from_secs(10);
+
+/// How long calls may take to end once the server was told to shut down; those that wait are sent away at once.
+const DRAIN: Duration = Duration::from_secs(5);
+
+/// Largest message to the cache service, bytes: 65536 points of a query fit.
+const CACHE_MESSAGE_MAX: usize = 2 << 20;
+
+/// Largest message to the frames service, bytes: the tiles of a lease fit.
+const FRAMES_MESSAGE_MAX: usize = 8 << 20;
+
+/// HTTP/2 windows, bytes: what a client may send ahead on one stream, and on one connection.
+const STREAM_WINDOW: u32 = 4 << 20;
+const CONNECTION_WINDOW: u32 = 8 << 20;
+
+/// Most calls at once on one connection.
+const CALLS_MAX: u32 = 256;
+
+/// What a server is made of.
+pub struct Config {
+    /// Bounds of what it keeps.
+    pub limits: Limits,
+    /// Where inserts are made durable.
+    pub journal: Box<dyn Journal>,
+    /// Where numbers of frames and leases begin; see [`crate::frames::Frames::new`].
+    pub first_number: u64,
+}
+
+impl Default for Config {
+    /// Keeps records in memory only; numbers begin at random.
+    fn default() -> Self {
+        // Below 2^52, so that scripts may hold them in a double.
+        let random = RandomState::new().build_hasher().finish() >> 32;
+        Self { limits: Limits::default(), journal: Box::new(Nowhere), first_number: (random << 20) + 1 }
+    }
+}
+
+/// The state behind all sockets of one server. Cheap to clone.
+#[derive(Clone)]
+pub struct Node {
+    store: Arc<Store>,
+    board: Arc<Board>,
+}
+
+impl Node {
+    /// Opens the store. Must be called within a tokio runtime, whose clock it uses from then on.
+    ///
+    /// # Errors
+    /// When the journal cannot be read.
+    pub fn new(config: Config) -> io::Result<Self> {
+        let store = Arc::new(Store::open(config.limits, config.journal)?);
+        let board = Arc::new(Board::new(store.clone(), Clock::start(), config.first_number));
+        Ok(Self { store, board })
+    }
+
+    /// Takes back lost leases, for ever.
+    pub async fn tick(&self) -> Infallible {
+        let mut ticks = tokio::time::interval(TICK);
+        loop {
+            ticks.tick().await;
+            self.board.tick();
+        }
+    }
+
+    /// Sends away all who wait: subscribers, owners of frames, workers without a lease.
+    pub fn close(&self) {
+        self.store.grown().close();
+        self.board.close();
+    }
+}
+
+/// Serves what `incoming` brings until `shutdown`, then lets calls end. [`Node::tick`] must run beside it, and somebody
+/// must call [`Node::close`] at shutdown, or subscriptions hold it open.
+///
+/// # Errors
+/// When the services cannot be built or the transport fails.
+pub async fn serve_on<I, IO>(
+    node: Node,
+    incoming: I,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), Box<dyn std::error::Error + Send + Sync>>
+where
+    I: Stream<Item = io::Result<IO>>,
+    IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+{
+    let cache = CacheServer::new(CacheService::new(node.store.clone(), node.board.clone()));
+    let frames = FramesServer::new(FramesService::new(node.board));
+    let (reporter, health) = tonic_health::server::health_reporter();
+    reporter.set_serving::<CacheServer<CacheService>>().await;
+    reporter.set_serving::<FramesServer<FramesService>>().await;
+    let reflection = tonic_reflection::server::Builder::configure()
+        .register_encoded_file_descriptor_set(cache_proto::DESCRIPTORS)
+        .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+        .build_v1()?;
+    Server::builder()
+        .http2_keepalive_interval(Some(KEEPALIVE))
+        .http2_keepalive_timeout(Some(KEEPALIVE))
+        .initial_stream_window_size(STREAM_WINDOW)
+        .initial_connection_window_size(CONNECTION_WINDOW)
+        .max_concurrent_streams(CALLS_MAX)
+        .add_service(cache.max_decoding_message_size(CACHE_MESSAGE_MAX))
+        .add_service(frames.max_decoding_message_size(FRAMES_MESSAGE_MAX))
+        .add_service(health)
+        .add_service(reflection)
+        .serve_with_incoming_shutdown(incoming, shutdown)
+        .await?;
+    Ok(())
+}
+
+/// Serves bound sockets until `shutdown`, then lets running calls end, for a few seconds at most. Files of Unix
+/// sockets are removed.
+///
+/// # Errors
+/// [`ServeError::Failed`] when the journal cannot be read or a transport fails.
+pub async fn serve(sockets: Vec<Bound>, config: Config, shutdown: impl Future<Output = ()>) -> Result<(), ServeError> {
+    let failed = |error: &dyn std::fmt::Display| ServeError::Failed(format!("cannot serve: {error}"));
+    let node = Node::new(config).map_err(|error| failed(&error))?;
+    let (stop, stopped) = watch::channel(false);
+    let mut serving = JoinSet::new();
+    for socket in sockets {
+        serving.spawn(serve_socket(node.clone(), socket.socket, stopped.clone()));
+    }
+    let ended = async {
+        while let Some(done) = serving.join_next().await {
+            done.map_err(|error| failed(&error))?.map_err(|error| failed(&error))?;
+        }
+        Ok(())
+    };
+    tokio::pin!(ended);
+    tokio::select! {
+        result = &mut ended => return result,
+        never = node.tick() => match never {},
+        () = shutdown => (),
+    }
+    node.close();
+    stop.send_replace(true);
+    if let Ok(result) = tokio::time::timeout(DRAIN, ended).await {
+        return result;
+    }
+    // Their tasks end with the runtime.
+    tracing::warn!("calls are still running after {} s; not waiting for them", DRAIN.as_secs());
+    Ok(())
+}
+
+async fn serve_socket(
+    node: Node,
+    socket: Socket,
+    mut stopped: watch::Receiver<bool>,
+) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+    let shutdown = async move {
+        // An error means that `serve` itself was dropped.
+        let _ = stopped.wait_for(|stopped| *stopped).await;
+    };
+    match socket {
+        Socket::Tcp(listener) => serve_on(node, TcpIncoming::from(listener).with_nodelay(Some(true)), shutdown).await,
+        Socket::Unix(listener, _file) => serve_on(node, UnixListenerStream::new(listener), shutdown).await,
+    }
+}
