@@ -16,11 +16,15 @@ const RANK_BITS: u32 = 6;
 /// Each round of the first pass ends at this many times the ranks tested before it.
 const GROWTH: f32 = 1.25;
 
-/// Rounds in each later pass, which only fills the holes that clamping tore.
+/// Rounds in each later pass: it only fills holes, those clamping tore and those seen from elsewhere within the pixels.
 const LATER_ROUNDS: u32 = 8;
 
-/// Passes over a level before the plan gives up on its last holes; Krivanek 2006 needed at most 11.
-pub const PASSES_MAX: u32 = 12;
+/// Passes over level 1, which the camera sees. Each looks at another point of every pixel, so that none would ever be
+/// the last where edges cross the picture; what four leave uncovered is rare enough to be gathered sample by sample.
+const PASSES: u32 = 4;
+
+/// Passes over a deeper level: a gather ray that meets a hole goes on as a path.
+const PASSES_DEEPER: u32 = 2;
 
 /// Rank of a pixel: bits of x^y and y interleaved, finest differences first.
 pub fn rank(x: u32, y: u32) -> u32 {
@@ -43,8 +47,8 @@ pub enum Step {
     Pixels,
 }
 
-/// Gives a frame's steps one after another: levels deepest first, each in passes until one gathers nothing, then the
-/// pixels.
+/// Gives a frame's steps one after another: levels deepest first, each in passes until one gathers nothing or there were
+/// enough, then the pixels.
 #[derive(Clone, Debug)]
 pub struct Plan {
     level: u32,
@@ -66,7 +70,8 @@ impl Plan {
         if self.level > 0 && self.from == RANKS {
             self.from = 0;
             self.pass += 1;
-            if self.gathered == 0 || self.pass == PASSES_MAX {
+            let passes = if self.level == 1 { PASSES } else { PASSES_DEEPER };
+            if self.gathered == 0 || self.pass == passes {
                 self.pass = 0;
                 self.level -= 1;
             }
@@ -152,6 +157,7 @@ mod tests {
         let passes =
             |all: &[Step]| all.iter().filter(|s| matches!(s, Step::Fill { ranks, .. } if ranks.start == 0)).count();
         assert_eq!(passes(&steps(1, |_| 0)), 1);
-        assert_eq!(passes(&steps(1, |_| 1)), PASSES_MAX as usize);
+        assert_eq!(passes(&steps(1, |_| 1)), PASSES as usize);
+        assert_eq!(passes(&steps(2, |_| 1)), (PASSES + PASSES_DEEPER) as usize);
     }
 }

@@ -20,7 +20,7 @@ use crate::world::World;
 pub const CHANNELS: usize = 13;
 
 /// Levels of records worth filling; deeper light continues as paths.
-const LEVELS_MAX: u32 = 2;
+const LEVELS_MAX: u32 = 3;
 
 /// Reach a record has at least, in pixels as projected at its site: level 1, and deeper levels.
 const REACH_MIN_PIXELS: [f32; 2] = [2.0, 6.0];
@@ -29,7 +29,7 @@ const REACH_MIN_PIXELS: [f32; 2] = [2.0, 6.0];
 const REACH_RATIO: f32 = 32.0;
 
 /// Rays of a deeper level's gather, as a fraction: its error is averaged over many rays of the level above.
-const DEEPER_RAYS: f32 = 0.25;
+const DEEPER_RAYS: f32 = 0.5;
 
 /// Rays gathered for a sample of a pixel that no record covers, as a fraction: its pixel's other samples share the error.
 const MISSED_RAYS: f32 = 0.0625;
@@ -48,6 +48,16 @@ pub struct Counts {
     pub queries: u64,
     /// Those that found no record and went on as paths.
     pub misses: u64,
+}
+
+impl Counts {
+    /// Adds what was counted elsewhere.
+    pub fn add(&mut self, other: &Self) {
+        self.path_rays += other.path_rays;
+        self.shadow_rays += other.shadow_rays;
+        self.queries += other.queries;
+        self.misses += other.misses;
+    }
 }
 
 /// A scene ready to be rendered with certain settings.
@@ -91,12 +101,19 @@ impl Frame {
 
     /// Tests the candidates of `tile` whose ranks lie in `ranks` and gathers a record of `level` where the sealed
     /// cache covers none. The result depends on nothing but the frame, the arguments and the sealed records.
-    pub fn fill(&self, level: u32, ranks: Range<u32>, tile: u32, sealed: &Levels) -> (Vec<Irradiance>, Counts) {
+    pub fn fill(
+        &self,
+        level: u32,
+        pass: u32,
+        ranks: Range<u32>,
+        tile: u32,
+        sealed: &Levels,
+    ) -> (Vec<Irradiance>, Counts) {
         let mut counts = Counts::default();
         let mut records = Vec::new();
         for [x, y] in self.settings.pixels(tile) {
             if ranks.contains(&rounds::rank(x, y))
-                && let Some(record) = self.candidate(level, x, y, sealed, &mut counts)
+                && let Some(record) = self.candidate(level, pass, x, y, sealed, &mut counts)
             {
                 records.push(record);
             }
@@ -105,8 +122,16 @@ impl Frame {
     }
 
     /// Tests one pixel's candidate and gathers its record where the sealed cache covers none.
-    pub fn candidate(&self, level: u32, x: u32, y: u32, sealed: &Levels, counts: &mut Counts) -> Option<Irradiance> {
-        let site = self.site(level, x, y, counts)?;
+    pub fn candidate(
+        &self,
+        level: u32,
+        pass: u32,
+        x: u32,
+        y: u32,
+        sealed: &Levels,
+        counts: &mut Counts,
+    ) -> Option<Irradiance> {
+        let site = self.site(level, pass, x, y, counts)?;
         let query = Query { position: site.at.position, normal: site.at.normal() };
         if sealed.get(level as usize - 1).is_some_and(|s| s.covers(&query)) {
             return None;
@@ -129,10 +154,13 @@ impl Frame {
     }
 
     /// The candidate of a pixel: the diffuse surface where a path from its middle has its `level`th meeting.
-    fn site(&self, level: u32, x: u32, y: u32, counts: &mut Counts) -> Option<Site> {
+    fn site(&self, level: u32, pass: u32, x: u32, y: u32, counts: &mut Counts) -> Option<Site> {
         let s = &self.settings;
-        let (mut origin, mut direction) = s.ray(x as f32 + 0.5, y as f32 + 0.5);
-        let mut sampler = Sampler::Stream(Random::named("walk", &[s.seed, x.into(), y.into(), level.into()]));
+        let mut sampler =
+            Sampler::Stream(Random::named("walk", &[s.seed, x.into(), y.into(), level.into(), pass.into()]));
+        // The first pass looks at the middle of each pixel, later ones elsewhere: what only edges see is found too.
+        let within = if pass == 0 { [0.5; 4] } else { sampler.next4() };
+        let (mut origin, mut direction) = s.ray(x as f32 + within[0], y as f32 + within[1]);
         let mut way = 0.0;
         for depth in 1.. {
             counts.path_rays += 1;

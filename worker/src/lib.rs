@@ -13,6 +13,7 @@
 //! - [`trace`]: what a ray sees where it lands: the second door, and the path tracer.
 //! - [`gather`]: a record of irradiance is made.
 //! - [`frame`]: the two kinds of work a worker leases: filling rounds and making pixels.
+//! - [`solo`]: a frame without a farm.
 //! - [`spec`]: settings on the wire.
 //! - [`client`]: the connection to a server.
 //! - [`replica`]: a copy of a namespace's log, and the caches sealed from a prefix of it.
@@ -39,6 +40,8 @@ pub mod trace;
 pub mod gather;
 
 pub mod frame;
+
+pub mod solo;
 
 pub mod client;
 pub mod farm;

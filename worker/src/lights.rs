@@ -1,4 +1,5 @@
-//! Where light comes from, and how shadow rays find it: one light per request, chosen by its power.
+//! Where light comes from, and how shadow rays find it: one light per request, chosen by
+//! what it may give there where there are few, else by its power.
 //!
 //! Light is *sampled* (shadow rays look for it; rays that meet it by chance count only by multiple importance sampling)
 //! or *gathered* (only rays that meet it by chance count; a record of irradiance includes it). Which one makes no
@@ -34,6 +35,9 @@ pub struct Lights {
 }
 
 const NONE: u32 = u32::MAX;
+
+/// Up to this many lights are weighed against each other wherever one is looked for; more are chosen by power alone.
+const FEW: usize = 16;
 
 #[derive(Clone, Copy)]
 enum Light {
@@ -120,9 +124,59 @@ impl Lights {
         self.of_triangle[triangle as usize] != NONE
     }
 
-    fn chance(&self, light: u32) -> f32 {
-        let before = if light == 0 { 0.0 } else { self.cumulative[light as usize - 1] };
-        self.cumulative[light as usize] - before
+    /// Chooses a light by `u` in [0, 1), and tells the chance it had; `None` when none shines towards `from`.
+    fn choose(&self, world: &World, from: Vec3, u: f32) -> Option<(usize, f32)> {
+        if self.lights.len() > FEW {
+            let choice = self.cumulative.partition_point(|c| *c <= u).min(self.lights.len() - 1);
+            return Some((choice, self.power_chance(choice)));
+        }
+        let mut shares = [0.0; FEW];
+        let total = self.shares(world, from, &mut shares);
+        let mut rest = u * total;
+        let mut choice = None;
+        for (i, &share) in shares.iter().enumerate().filter(|(_, s)| **s > 0.0) {
+            choice = Some((i, share / total));
+            rest -= share;
+            if rest < 0.0 {
+                break;
+            }
+        }
+        choice
+    }
+
+    /// The chance of choosing a light from `from`.
+    fn chance(&self, world: &World, from: Vec3, light: u32) -> f32 {
+        if self.lights.len() > FEW {
+            return self.power_chance(light as usize);
+        }
+        let mut shares = [0.0; FEW];
+        let total = self.shares(world, from, &mut shares);
+        if total > 0.0 { shares[light as usize] / total } else { 0.0 }
+    }
+
+    fn power_chance(&self, light: usize) -> f32 {
+        let before = if light == 0 { 0.0 } else { self.cumulative[light - 1] };
+        self.cumulative[light] - before
+    }
+
+    /// Roughly the irradiance each of few lights would give a surface that faces it, unhidden; and their sum.
+    fn shares(&self, world: &World, from: Vec3, shares: &mut [f32; FEW]) -> f32 {
+        for (light, share) in self.lights.iter().zip(shares.iter_mut()) {
+            *share = match *light {
+                Light::Triangle { index, area, normal, emission } => {
+                    let [a, b, c] = world.scene.triangles[index as usize].positions;
+                    let offset = (a + b + c) * (1.0 / 3.0) - from;
+                    let (distance2, height) = (offset.length_squared(), -normal.dot(a - from));
+                    // Near a lamp its middle says little: no more than a hemisphere of it, no less than a twentieth.
+                    let cosine = (height / distance2.sqrt()).max(0.05);
+                    if height > 0.0 { luminance(emission) * area * cosine / (distance2 + area) } else { 0.0 }
+                }
+                Light::Point(point) => luminance(point.intensity) / (point.position - from).length_squared().max(1e-12),
+                Light::Distant(light) if light.is_beam() => luminance(light.strength),
+                Light::Distant(light) => luminance(light.strength) * 2.0 * PI * (1.0 - light.cos_half_angle),
+            };
+        }
+        shares.iter().sum()
     }
 
     /// Density, by solid angle, of looking from `from` for the light of a triangle, where a ray along `direction` met it
@@ -137,23 +191,31 @@ impl Lights {
             Some(near) => 1.0 / near.solid_angle,
             None => distance * distance / (area * normal.dot(direction).abs()),
         };
-        self.chance(light) * density
+        self.chance(world, from, light) * density
     }
 
     /// What a ray that meets nothing sees: for each distant light in that direction its radiance and its density, 0 for
     /// light that is not sampled.
-    pub fn beyond<'a>(&'a self, world: &'a World, direction: Vec3) -> impl Iterator<Item = (Rgb, f32)> + 'a {
+    pub fn beyond<'a>(
+        &'a self,
+        world: &'a World,
+        from: Vec3,
+        direction: Vec3,
+    ) -> impl Iterator<Item = (Rgb, f32)> + 'a {
         let seen = move |d: &DistantLight| !d.is_beam() && direction.dot(d.to_light) >= d.cos_half_angle;
-        world.scene.distant.iter().zip(&self.of_distant).filter(move |(d, _)| seen(d)).map(|(d, &light)| {
-            let pdf = if light == NONE { 0.0 } else { self.chance(light) / (2.0 * PI * (1.0 - d.cos_half_angle)) };
+        world.scene.distant.iter().zip(&self.of_distant).filter(move |(d, _)| seen(d)).map(move |(d, &light)| {
+            let pdf = if light == NONE {
+                0.0
+            } else {
+                self.chance(world, from, light) / (2.0 * PI * (1.0 - d.cos_half_angle))
+            };
             (d.strength, pdf)
         })
     }
 
     /// Chooses a light and a point on it by `u` in [0, 1)³, as seen from `from`; `None` when it does not shine there.
     pub fn sample(&self, world: &World, from: Vec3, u: [f32; 3]) -> Option<Arrival> {
-        let choice = self.cumulative.partition_point(|c| *c <= u[0]).min(self.lights.len().checked_sub(1)?);
-        let chance = self.chance(choice as u32);
+        let (choice, chance) = self.choose(world, from, u[0])?;
         match self.lights[choice] {
             Light::Triangle { index, area, normal, emission } => {
                 let corners = &world.scene.triangles[index as usize].positions;

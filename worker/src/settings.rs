@@ -62,6 +62,22 @@ pub struct Settings {
 pub const TILE: u32 = 16;
 
 impl Settings {
+    /// The defaults, for a picture of `width` by `height` pixels: what they reach is charted in the README.
+    pub fn new(camera: Camera, width: u32, height: u32) -> Self {
+        let camera = camera.with_aspect(width as f32 / height as f32);
+        Self {
+            camera,
+            width,
+            height,
+            spp: 32,
+            method: Method::Irradiance,
+            a: 0.3,
+            rays: 2048,
+            bounces: ALL_BOUNCES,
+            seed: 0,
+        }
+    }
+
     /// Tiles of the picture, numbered row by row.
     pub fn tiles(&self) -> u32 {
         self.width.div_ceil(TILE) * self.height.div_ceil(TILE)

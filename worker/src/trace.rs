@@ -87,7 +87,7 @@ impl Tracer<'_> {
             let meeting = self.world.meet(origin, direction);
             let emitted = match &meeting {
                 Some(at) => self.emitted(at, origin, direction, chance),
-                None => self.beyond(direction, chance),
+                None => self.beyond(origin, direction, chance),
             };
             seen.add(throughput * emitted, depth <= first + 1 && first == 1);
             let Some(at) = meeting else { break };
@@ -236,13 +236,13 @@ impl Tracer<'_> {
         }
     }
 
-    fn beyond(&self, direction: Vec3, chance: Chance) -> Rgb {
+    fn beyond(&self, from: Vec3, direction: Vec3, chance: Chance) -> Rgb {
         let share = |pdf: f32| match chance {
             Chance::All => 1.0,
             Chance::Gathered => f32::from(pdf == 0.0),
             Chance::Weighed(own) => heuristic(own, pdf),
         };
-        self.lights.beyond(self.world, direction).map(|(radiance, pdf)| radiance * share(pdf)).sum()
+        self.lights.beyond(self.world, from, direction).map(|(radiance, pdf)| radiance * share(pdf)).sum()
     }
 }
 

@@ -1,0 +1,117 @@
+//! What the tests share: the scenes and references beside them, and the measure both are held to.
+#![allow(dead_code)]
+
+use std::path::{Path, PathBuf};
+
+use exr::prelude::*;
+use worker::frame::{CHANNELS, Frame};
+use worker::scene::{self, Camera, Scene};
+use worker::settings::{ALL_BOUNCES, Settings};
+use worker::solo::{self, Order};
+
+/// Edge of the references in pixels.
+pub const SIZE: usize = 128;
+
+/// A file beside the tests.
+pub fn file(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests").join(name)
+}
+
+/// A scene and its camera.
+pub fn load(name: &str) -> (Scene, Camera) {
+    let path = file("scenes").join(name);
+    let scene = scene::load(&path).unwrap_or_else(|e| panic!("{e}"));
+    let camera = match scene.cameras.first() {
+        Some(camera) => camera.clone(),
+        None => scene::load_view(&path.with_extension("vf")).unwrap_or_else(|e| panic!("{e}")),
+    };
+    (scene, camera)
+}
+
+/// Default settings for a square picture of `SIZE` pixels; `depth` is "one" or "full".
+pub fn settings(camera: Camera, depth: &str) -> Settings {
+    let bounces = if depth == "one" { 1 } else { ALL_BOUNCES };
+    Settings { bounces, ..Settings::new(camera, SIZE as u32, SIZE as u32) }
+}
+
+/// Renders in this process; linear RGB, row by row.
+pub fn render(scene: Scene, settings: Settings) -> Vec<[f64; 3]> {
+    let frame = Frame::new(scene, settings);
+    let levels = solo::fill(&frame, Order::Rounds);
+    let (pixels, _) = solo::pixels(&frame, &levels);
+    pixels.chunks_exact(CHANNELS).map(|p| [p[0].into(), p[1].into(), p[2].into()]).collect()
+}
+
+/// A reference picture with its standard error of luminance, pixel by pixel.
+pub struct Reference {
+    pub image: Vec<[f64; 3]>,
+    pub error: Vec<f64>,
+}
+
+/// Reads `tests/references/NAME.exr`, for instance "cornell.full".
+pub fn reference(name: &str) -> Reference {
+    let path = file("references").join(format!("{name}.exr"));
+    let image = read_first_flat_layer_from_file(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+    let channels = image.layer_data.channel_data.list;
+    let values = |name: &str| -> Vec<f64> {
+        let channel = channels.iter().find(|c| c.name.eq(name)).unwrap_or_else(|| panic!("no channel {name}"));
+        channel.sample_data.values_as_f32().map(f64::from).collect()
+    };
+    let [r, g, b] = ["R", "G", "B"].map(values);
+    let image = r.iter().zip(&g).zip(&b).map(|((r, g), b)| [*r, *g, *b]).collect();
+    Reference { image, error: values("stderr") }
+}
+
+/// How far a picture is from a reference, relative to the reference's mean.
+#[derive(Debug)]
+pub struct Verdict {
+    /// Root mean square over all channels, the reference's own noise subtracted.
+    pub rmse: f64,
+    /// Difference of the means.
+    pub bias: f64,
+    /// Largest difference of an 8 x 8 block's mean.
+    pub worst: f64,
+}
+
+/// Judges a picture; pixels that see a lamp, and their neighbours, are left out: how edges of lamps are covered says
+/// nothing about indirect light.
+pub fn judge(image: &[[f64; 3]], reference: &Reference) -> Verdict {
+    let hot = lamps(&reference.image);
+    let cold: Vec<usize> = (0..image.len()).filter(|i| !hot[*i]).collect();
+    let mean = |im: &[[f64; 3]]| cold.iter().flat_map(|&i| im[i]).sum::<f64>() / (3 * cold.len()) as f64;
+    let scale = mean(&reference.image);
+    let squares: f64 =
+        cold.iter().flat_map(|&i| (0..3).map(move |c| (image[i][c] - reference.image[i][c]).powi(2))).sum();
+    let noise: f64 = cold.iter().map(|&i| reference.error[i].powi(2)).sum::<f64>() / cold.len() as f64;
+    let mut worst = 0f64;
+    for block in 0..(SIZE / 8).pow(2) {
+        let (x0, y0) = (block % (SIZE / 8) * 8, block / (SIZE / 8) * 8);
+        let inside: Vec<usize> = (0..64).map(|k| (y0 + k / 8) * SIZE + x0 + k % 8).filter(|i| !hot[*i]).collect();
+        if inside.len() > 32 {
+            for c in 0..3 {
+                let sum: f64 = inside.iter().map(|&i| image[i][c] - reference.image[i][c]).sum();
+                worst = worst.max((sum / inside.len() as f64).abs());
+            }
+        }
+    }
+    Verdict {
+        rmse: (squares / (3 * cold.len()) as f64 - noise).max(0.0).sqrt() / scale,
+        bias: mean(image) / scale - 1.0,
+        worst: worst / scale,
+    }
+}
+
+fn lamps(image: &[[f64; 3]]) -> Vec<bool> {
+    let brightest: Vec<f64> = image.iter().map(|p| p.iter().copied().fold(0.0, f64::max)).collect();
+    let mut sorted = brightest.clone();
+    sorted.sort_by(f64::total_cmp);
+    let limit = 1.3 * sorted[sorted.len() * 98 / 100];
+    let lit = |x: usize, y: usize| brightest[y % SIZE * SIZE + x % SIZE] > limit;
+    let near = |i: usize| {
+        let (x, y) = (i % SIZE + SIZE, i / SIZE + SIZE);
+        (0..9).any(|k| lit(x + k % 3 - 1, y + k / 3 - 1))
+    };
+    let hot: Vec<bool> = (0..image.len()).map(near).collect();
+    let share = hot.iter().filter(|h| **h).count() as f64 / hot.len() as f64;
+    if share > 0.05 { vec![false; hot.len()] } else { hot }
+}
