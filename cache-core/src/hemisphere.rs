@@ -162,7 +162,7 @@ mod tests {
         let mut random = Random::named("test", &[1]);
         let samples: Vec<_> = (0..strata.rays())
             .map(|i| {
-                let (radiance, distance) = world(strata.direction(i, Vec2::new(random.next(), random.next())));
+                let (radiance, distance) = world(strata.direction(i, Vec2::new(random.uniform(), random.uniform())));
                 Sample { radiance: Rgb::splat(radiance), distance }
             })
             .collect();

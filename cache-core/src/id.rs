@@ -87,7 +87,7 @@ impl Random {
 
     /// The next number, uniform in [0, 1).
     #[inline]
-    pub fn next(&mut self) -> f32 {
+    pub fn uniform(&mut self) -> f32 {
         (self.0.next_u64() >> 40) as f32 * (1.0 / (1 << 24) as f32)
     }
 }
@@ -124,8 +124,8 @@ mod tests {
         let mut b = Random::of(RecordId(7));
         let (mut sum, mut squares) = (0.0, 0.0);
         for _ in 0..100_000 {
-            let x = a.next();
-            assert_eq!(x, b.next());
+            let x = a.uniform();
+            assert_eq!(x, b.uniform());
             assert!((0.0..1.0).contains(&x));
             sum += f64::from(x);
             squares += f64::from(x) * f64::from(x);

@@ -310,7 +310,7 @@ mod tests {
                     let n = 400_000;
                     let (mut sampled, mut uniform, mut mass) = (Rgb::ZERO, Rgb::ZERO, 0f64);
                     for _ in 0..n {
-                        let u = [random.next(), random.next(), random.next()];
+                        let u = [random.uniform(), random.uniform(), random.uniform()];
                         if let Some(s) = bsdf.sample(wo, part, u) {
                             sampled += s.weight / n as f32;
                         }
@@ -342,7 +342,7 @@ mod tests {
             let mut random = Random::named("energy", &[]);
             let mut sum = Rgb::ZERO;
             for _ in 0..100_000 {
-                let u = [random.next(), random.next(), random.next()];
+                let u = [random.uniform(), random.uniform(), random.uniform()];
                 sum += bsdf.sample(a, Part::All, u).map_or(Rgb::ZERO, |s| s.weight) / 1e5;
             }
             assert!(sum.max_element() < 1.01, "{name}: {sum}");

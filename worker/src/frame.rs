@@ -191,7 +191,7 @@ impl Frame {
         let mut pixels = Vec::new();
         for [x, y] in self.settings.pixels(tile) {
             let seed =
-                (Random::named("pixel", &[self.settings.seed, x.into(), y.into()]).next() * (1 << 24) as f32) as u32;
+                (Random::named("pixel", &[self.settings.seed, x.into(), y.into()]).uniform() * (1 << 24) as f32) as u32;
             let mut sum = [0f32; CHANNELS];
             for index in 0..self.settings.spp {
                 let mut sampler = Sampler::pixel(index, seed);

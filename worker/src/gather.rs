@@ -51,7 +51,7 @@ impl Gather<'_> {
         let id = origin.id();
         let mut random = Random::of(id);
         // A turn of the strata about the normal, so that neighbouring records do not err alike.
-        let frame = turned(site.at.frame, random.next());
+        let frame = turned(site.at.frame, random.uniform());
         let mut sampler = Sampler::Stream(random);
         let samples = self.tracer.hemisphere(&site.at, frame, self.level, self.strata, &mut sampler, counts);
         let estimate = self.strata.estimate(&samples);

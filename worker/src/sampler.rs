@@ -40,11 +40,11 @@ impl Sampler {
             }
             Self::Pixel { index, seed, .. } => {
                 let mut random = Random::named("long path", &[u64::from(*index), u64::from(*seed)]);
-                let four = std::array::from_fn(|_| random.next());
+                let four = std::array::from_fn(|_| random.uniform());
                 *self = Self::Stream(random);
                 four
             }
-            Self::Stream(random) => std::array::from_fn(|_| random.next()),
+            Self::Stream(random) => std::array::from_fn(|_| random.uniform()),
         }
     }
 }

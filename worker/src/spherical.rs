@@ -67,7 +67,7 @@ mod tests {
         let mut random = Random::named("octant", &[]);
         let (mut mean, n) = (Vec3::ZERO, 200_000);
         for _ in 0..n {
-            let d = octant.sample(random.next(), random.next());
+            let d = octant.sample(random.uniform(), random.uniform());
             assert!(d.min_element() > -1e-4 && d.is_normalized());
             mean += d / n as f32;
         }
@@ -87,7 +87,7 @@ mod tests {
         let mut random = Random::named("lamp", &[]);
         let (mut by_angle, mut by_area, n) = (0f64, 0f64, 400_000);
         for _ in 0..n {
-            let (u, v) = (random.next(), random.next());
+            let (u, v) = (random.uniform(), random.uniform());
             by_angle += f64::from(triangle.sample(u, v).z * triangle.solid_angle) / f64::from(n);
             let s = u.sqrt();
             let p = corners[0] * (1.0 - s) + corners[1] * (s * (1.0 - v)) + corners[2] * (s * v);
