@@ -268,7 +268,7 @@ mod tests {
                 let part = lived.part(caches.position(), step as u64).expect("arrived");
                 last = caches.seal(&part, digests[step]).expect("same records");
             }
-            let mut expected: Levels = vec![Arc::new(Sealed::new(0.8)); 2];
+            let mut expected: Levels = (0..2).map(|_| Arc::new(Sealed::new(0.8))).collect();
             for (level, record) in latest(&log[..end]) {
                 if let Some(sealed) = expected.get_mut(level as usize - 1) {
                     Arc::make_mut(sealed).extend([record]);

@@ -35,8 +35,8 @@ pub fn run(
             return None;
         }
         let counts = match convert::plan_step(step) {
-            Step::Fill { level, ranks, .. } => {
-                let (records, counts) = frame.fill(level, ranks, tile, levels);
+            Step::Fill { level, pass, ranks } => {
+                let (records, counts) = frame.fill(level, pass, ranks, tile, levels);
                 done.records.extend(records.into_iter().map(|r| (level, r)));
                 counts
             }
