@@ -39,16 +39,18 @@ pub struct RenderArgs {
     #[arg(long, value_name = "NAME | FILE.vf")]
     pub camera: Option<String>,
     /// Samples a pixel
-    #[arg(long, value_name = "N", default_value_t = defaults::SPP)]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536),
+          default_value_t = defaults::SPP)]
     pub spp: u32,
     /// How indirect light is computed; auto is irradiance
-    #[arg(long, value_parser = ["auto", "irradiance", "path"], default_value = defaults::METHOD)]
+    #[arg(long, value_name = "M", value_parser = ["auto", "irradiance", "path"], default_value = defaults::METHOD)]
     pub method: String,
     /// Allowed interpolation error of a record (Ward 1988): smaller is slower and more accurate
-    #[arg(long, value_name = "A", default_value_t = defaults::A)]
+    #[arg(long, value_name = "A", value_parser = allowed_error, default_value_t = defaults::A)]
     pub a: f32,
     /// Rays in one gather
-    #[arg(long, value_name = "N", default_value_t = defaults::RAYS)]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(4..=1 << 20),
+          default_value_t = defaults::RAYS)]
     pub rays: u32,
     /// Indirect bounces: a number, or all
     #[arg(long, value_name = "N", value_parser = bounces, default_value = defaults::BOUNCES)]
@@ -185,6 +187,11 @@ fn size(text: &str) -> Result<[u32; 2], String> {
     }
 }
 
+fn allowed_error(text: &str) -> Result<f32, String> {
+    let a = text.parse().ok().filter(|a| *a > 0.0 && *a <= 10.0);
+    a.ok_or_else(|| "expected a number more than 0 and at most 10".into())
+}
+
 fn bounces(text: &str) -> Result<u32, String> {
     match text {
         "all" => Ok(ALL_BOUNCES),
@@ -244,9 +251,6 @@ mod tests {
     fn wrong_usage_says_what_and_where() {
         let settings = |rest: &[&str]| usage(args(rest).settings(&scene()));
         assert_eq!(settings(&["--camera", "top"]), "--camera top: scene.glb has the cameras \"front\", \"back\"");
-        assert_eq!(settings(&["--spp", "0"]), "--spp is 0, expected 1 to 65536");
-        assert_eq!(settings(&["--a", "nan"]), "--a is NaN, expected more than 0 and at most 10");
-        assert_eq!(settings(&["--rays", "3"]), "--rays is 3, expected 4 to 1048576");
         let none = usage(args(&[]).settings(&Scene::default()));
         assert_eq!(none, "scene.glb has no camera: name a view file with --camera FILE.vf");
 
@@ -260,6 +264,14 @@ mod tests {
         assert_eq!(usage(other.check()), "--output out.png: expected a name ending in .exr");
         for wrong in ["0x5", "5", "axb", "5x70000", "5x"] {
             assert!(size(wrong).is_err());
+        }
+        for wrong in
+            [["--spp", "0"], ["--a", "nan"], ["--a", "0"], ["--rays", "3"], ["--threads", "0"], ["--spp", "70000"]]
+        {
+            assert!(
+                Line::try_parse_from(["render", "a.glb", "-o", "b.exr"].iter().chain(&wrong)).is_err(),
+                "{wrong:?}"
+            );
         }
         assert!(bounces("-1").is_err() && bounces("some").is_err());
     }

@@ -73,6 +73,11 @@ fn main() -> ExitCode {
             drop(error.print());
             return ExitCode::SUCCESS;
         }
+        Err(error) if error.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => {
+            return end(Err(Failure::usage(
+                "expected a command: render, serve, worker or compare (see ambience --help)",
+            )));
+        }
         Err(error) => return end(Err(Failure::usage(one_line(&error.render().to_string())))),
     };
     end(match cli.command {

@@ -18,7 +18,8 @@ const BAR: u64 = 1000;
 
 enum Shown {
     Bar(ProgressBar),
-    Lines(Option<Instant>),
+    /// When the last line was.
+    Lines(Instant),
     Nothing,
 }
 
@@ -27,11 +28,13 @@ pub struct Progress {
     shown: Shown,
     phase: String,
     since: Instant,
+    /// Whether workers are on their way without anybody's doing.
+    own: bool,
 }
 
 impl Progress {
-    /// A bar if stderr is a terminal, else lines; nothing if `quiet`.
-    pub fn new(quiet: bool) -> Self {
+    /// A bar if stderr is a terminal, else lines; nothing if `quiet`. With `own` workers nobody need be told to start some.
+    pub fn new(quiet: bool, own: bool) -> Self {
         let shown = if quiet {
             Shown::Nothing
         } else if console_is_terminal() {
@@ -40,9 +43,9 @@ impl Progress {
             bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
             Shown::Bar(bar)
         } else {
-            Shown::Lines(None)
+            Shown::Lines(Instant::now())
         };
-        Self { shown, phase: String::new(), since: Instant::now() }
+        Self { shown, phase: String::new(), since: Instant::now(), own }
     }
 
     /// Shows a phase of which no share is known.
@@ -54,14 +57,22 @@ impl Progress {
     pub fn frame(&mut self, progress: &v1::FrameProgress) {
         let Some(step) = &progress.step else { return };
         let phase = phase_name(step);
-        if progress.workers == 0 {
-            return self.phase("waiting for workers");
+        if progress.workers == 0 && !self.own {
+            return self.wait("waiting for workers");
         }
         let shown = match step.level {
             0 => format!("pixels · {} records", progress.records),
             level => format!("level {level} pass {} · {} records", step.pass + 1, progress.records),
         };
         self.show(&format!("{phase} {}", step.pass), shown, Some(share(progress)));
+    }
+
+    /// Shows what others have to do first; as a line that stays where there is no bar.
+    pub fn wait(&mut self, what: &str) {
+        if matches!(self.shown, Shown::Lines(_)) && self.phase != what {
+            self.note(what);
+        }
+        self.phase(what);
     }
 
     fn show(&mut self, phase: &str, text: String, share: Option<f64>) {
@@ -77,8 +88,8 @@ impl Progress {
                 bar.set_prefix(left.map_or(String::new(), |l| format!(", {} left in this phase", HumanDuration(l))));
                 bar.set_message(text);
             }
-            Shown::Lines(last) if last.is_none_or(|l| now - l >= LINES) => {
-                *last = Some(now);
+            Shown::Lines(last) if now - *last >= LINES => {
+                *last = now;
                 let left = left.map_or(String::new(), |l| format!(", {} s left in this phase", l.as_secs()));
                 let share = share.map_or(String::new(), |s| format!(", {:.0} %", s * 100.0));
                 eprintln!("ambience: {text}{share}{left}");
@@ -136,7 +147,7 @@ fn share(progress: &v1::FrameProgress) -> f64 {
 
 /// Time left if the rest goes as the part before; `None` when too little of it is done to tell.
 fn remaining(elapsed: Duration, share: f64) -> Option<Duration> {
-    let known = share >= SHARE_MIN && share <= 1.0 && elapsed >= TIME_MIN;
+    let known = (SHARE_MIN..=1.0).contains(&share) && elapsed >= TIME_MIN;
     known.then(|| elapsed.mul_f64((1.0 - share) / share))
 }
 

@@ -28,6 +28,9 @@ const RESTARTS: u32 = 3;
 /// How long the server may take to hear that a worker died; its leases run out a little later anyway.
 const LEAVE: Duration = Duration::from_secs(2);
 
+/// A server that answers later than this has to be waited for, and the user told.
+const SLOW: Duration = Duration::from_secs(1);
+
 /// Rays across and down with which a black picture is examined.
 const PROBES: u32 = 24;
 
@@ -73,7 +76,7 @@ async fn signalled() -> u8 {
 }
 
 async fn render(args: &RenderArgs, children: &mut Children) -> Result<(), Failure> {
-    let (mut stats, mut progress) = (Stats::default(), Progress::new(args.quiet));
+    let (mut stats, mut progress) = (Stats::default(), Progress::new(args.quiet, args.workers() > 0));
     stats.phase("load");
     progress.phase("loading the scene");
     let job = {
@@ -238,12 +241,16 @@ impl Render<'_> {
             async move { frames.open(request).await }
         });
         tokio::pin!(opening);
+        let slow = tokio::time::sleep(SLOW);
+        tokio::pin!(slow);
         loop {
             tokio::select! {
                 opened = &mut opening => {
-                    let failed = |status: Status| Failure::failed(format!("server {server}: {}", status.message()));
+                    let away = |s: &Status| if client::is_passing(s) { "away for too long: " } else { "" };
+                    let failed = |s: Status| Failure::failed(format!("server {server}: {}{}", away(&s), s.message()));
                     return opened.map(Ok).map_err(failed);
                 }
+                () = &mut slow, if !slow.is_elapsed() => self.progress.wait(&format!("waiting for server {server}")),
                 event = self.children.next() => if let Some(end) = self.child(event, server, frames).await? {
                     return Ok(Err(end));
                 },

@@ -95,7 +95,13 @@ pub fn block_on(args: WorkerArgs) -> anyhow::Result<()> {
 pub fn log_to_stderr() {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env();
     let filter = filter.unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).without_time().init();
+    let colored = std::io::IsTerminal::is_terminal(&std::io::stderr());
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_ansi(colored)
+        .without_time()
+        .init();
 }
 
 /// Cores this process may use.
@@ -166,6 +172,8 @@ pub struct Worker {
     /// Last used last.
     loaded: Mutex<Vec<(u64, Slot)>>,
     followers: Mutex<HashMap<Namespace, Arc<Follower>>>,
+    /// Frames declined; every thread may hold a lease of one, its owner is told once.
+    declined: Mutex<HashSet<u64>>,
 }
 
 impl Worker {
@@ -178,6 +186,7 @@ impl Worker {
             held: Mutex::default(),
             loaded: Mutex::default(),
             followers: Mutex::default(),
+            declined: Mutex::default(),
         }
     }
 
@@ -268,6 +277,9 @@ impl Worker {
     }
 
     async fn decline(&self, frame: u64, reason: String) -> Result<(), Status> {
+        if !lock(&self.declined).insert(frame) {
+            return Ok(());
+        }
         warn!(frame, reason, "declining");
         let request = v1::DeclineRequest { worker: self.name.clone(), frame, reason };
         let declined = client::retry(|| {

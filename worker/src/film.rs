@@ -268,7 +268,10 @@ fn temporary(path: &Path) -> std::io::Result<NamedTempFile> {
 
 /// The plain reason, without the temporary's path that tempfile adds.
 fn reason(error: &std::io::Error) -> String {
-    std::io::Error::from(error.kind()).to_string()
+    match error.kind() {
+        std::io::ErrorKind::NotFound => "no such folder".into(),
+        kind => kind.to_string(),
+    }
 }
 
 /// The linear RGB of an EXR file.
@@ -404,7 +407,7 @@ mod tests {
         drop(stage(&path, b"half").expect("staged"));
         assert_eq!(std::fs::read_dir(folder.path()).expect("listed").count(), 0);
         let missing = check_writable(&folder.path().join("none/a.exr")).expect_err("no folder").to_string();
-        assert!(missing.contains("none/a.exr: cannot be written there"), "{missing}");
+        assert!(missing.ends_with("none/a.exr: cannot be written there: no such folder"), "{missing}");
         assert!(check_writable(folder.path()).expect_err("folder").to_string().ends_with("is a directory"));
         std::fs::write(&path, b"not a picture").expect("written");
         assert!(read(&path).expect_err("damaged").to_string().contains("a.exr: is no picture"));
