@@ -1,8 +1,6 @@
 //! Pictures against trusted references: the path tracer by statistics, the cached method by the bar it must meet.
 
-mod common;
-
-use common::{SIZE, judge, load, reference, render, settings};
+use ambience_bench::judge::{SIZE, judge, load, reference, render, settings};
 use worker::settings::{Method, Settings};
 
 const SCENES: [(&str, &str); 7] = [

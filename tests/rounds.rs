@@ -1,8 +1,6 @@
 //! What sharing the work costs: records made in rounds against records made one after another.
 
-mod common;
-
-use common::{load, settings};
+use ambience_bench::judge::{load, settings};
 use worker::frame::Frame;
 use worker::settings::Settings;
 use worker::solo::{self, Order};

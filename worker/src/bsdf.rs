@@ -81,11 +81,11 @@ impl Bsdf {
             Surface::Metal { specular, roughness } => {
                 Self { diffuse: color * (1.0 - specular), gloss: ward(color * specular, roughness) }
             }
-            Surface::Gltf { metallic, roughness, specular, ior } => {
+            Surface::Gltf { metallic, roughness, specular, specular_color, ior } => {
                 let base = color * (1.0 - metallic);
                 let normal = ((ior - 1.0) / (ior + 1.0)) * ((ior - 1.0) / (ior + 1.0));
-                let f0 = (specular * normal).min(Rgb::ONE);
-                let f90 = specular.max_element().min(1.0);
+                let f0 = (specular_color * normal).min(Rgb::ONE) * specular;
+                let f90 = specular;
                 let alpha = (roughness * roughness).max(ALPHA_MIN);
                 let gloss = if metallic == 0.0 && f90 == 0.0 {
                     Gloss::None
@@ -282,7 +282,13 @@ mod tests {
 
     fn models() -> Vec<(&'static str, Bsdf)> {
         let color = Rgb::new(0.8, 0.5, 0.2);
-        let gltf = |metallic, roughness| Surface::Gltf { metallic, roughness, specular: Rgb::ONE, ior: 1.5 };
+        let gltf = |metallic, roughness| Surface::Gltf {
+            metallic,
+            roughness,
+            specular: 1.0,
+            specular_color: Rgb::ONE,
+            ior: 1.5,
+        };
         let surfaces = [
             ("diffuse", Surface::Diffuse),
             ("plastic", Surface::Plastic { specular: 0.3, roughness: 0.2 }),

@@ -77,15 +77,16 @@ pub struct Material {
 pub enum Surface {
     /// Lambert: BRDF `color / pi`.
     Diffuse,
-    /// Metallic-roughness of glTF 2.0, appendix B. `specular` is KHR_materials_specular's specularFactor times
-    /// specularColorFactor, `ior` the index of refraction (1.5 unless KHR_materials_ior says otherwise).
+    /// Metallic-roughness of glTF 2.0, appendix B, with KHR_materials_specular and KHR_materials_ior.
     Gltf {
         /// 0 dielectric to 1 metal.
         metallic: f32,
         /// Perceptual roughness, 0 to 1; alpha is its square.
         roughness: f32,
-        /// Strength of the dielectric coat, 0 to 1 per channel.
-        specular: Rgb,
+        /// Strength of the dielectric coat (specularFactor), 0 to 1.
+        specular: f32,
+        /// Colour of the coat seen from straight above (specularColorFactor), 0 or more.
+        specular_color: Rgb,
         /// Index of refraction of the dielectric.
         ior: f32,
     },
@@ -212,29 +213,32 @@ fn content_hash(scene: &Scene) -> [u8; 32] {
             hasher.update(&v.to_le_bytes());
         }
     };
+    // Lengths first: no value can pass from one list to the next.
+    let lengths = [scene.triangles.len(), scene.materials.len(), scene.textures.len(), scene.points.len()];
+    add(&lengths.map(|n| f32::from_bits(n as u32)));
     for t in &scene.triangles {
         for i in 0..3 {
             add(&t.positions[i].to_array());
             add(&t.normals.map_or([0.0; 3], |n| n[i].to_array()));
             add(&t.uvs[i].to_array());
         }
-        add(&[t.material as f32]);
+        add(&[f32::from_bits(t.material)]);
     }
     for m in &scene.materials {
         add(&m.color.to_array());
         add(&m.emission.to_array());
-        add(&[m.texture.map_or(-1.0, |t| t as f32), f32::from(m.double_sided), f32::from(m.sampled)]);
+        add(&[f32::from_bits(m.texture.unwrap_or(u32::MAX)), f32::from(m.double_sided), f32::from(m.sampled)]);
         match m.surface {
             Surface::Diffuse => add(&[0.0]),
-            Surface::Gltf { metallic, roughness, specular, ior } => {
-                add(&[1.0, metallic, roughness, specular.x, specular.y, specular.z, ior])
+            Surface::Gltf { metallic, roughness, specular, specular_color: c, ior } => {
+                add(&[1.0, metallic, roughness, specular, c.x, c.y, c.z, ior])
             }
             Surface::Plastic { specular, roughness } => add(&[2.0, specular, roughness]),
             Surface::Metal { specular, roughness } => add(&[3.0, specular, roughness]),
         }
     }
     for t in &scene.textures {
-        add(&[t.width as f32, t.height as f32, t.wrap[0] as u8 as f32, t.wrap[1] as u8 as f32]);
+        add(&[f32::from_bits(t.width), f32::from_bits(t.height), t.wrap[0] as u8 as f32, t.wrap[1] as u8 as f32]);
         for texel in &t.texels {
             add(&texel.to_array());
         }

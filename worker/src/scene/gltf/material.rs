@@ -166,20 +166,17 @@ fn surface(pbr: &PbrMetallicRoughness, extensions: &Extensions) -> Result<Surfac
     let roughness = factor("roughnessFactor", pbr.roughness_factor.0, 1.0)?;
     let (strength, color) =
         extensions.specular.as_ref().map_or((1.0, [1.0; 3]), |s| (s.specular_factor.0, s.specular_color_factor.0));
-    let strength = factor("specularFactor", strength, 1.0)?;
-    let specular = rgb("specularColorFactor", color, f32::MAX)? * strength;
-    if specular.max_element() > 1.0 {
-        return Err(format!("specularFactor times specularColorFactor is {specular}; expected at most 1"));
-    }
+    let specular = factor("specularFactor", strength, 1.0)?;
+    let specular_color = rgb("specularColorFactor", color, f32::MAX)?;
     let ior = extensions.ior.as_ref().map_or(1.5, |ior| ior.ior.0);
     if !(ior >= 1.0 && ior.is_finite()) {
         return Err(format!("ior is {ior}; expected at least 1"));
     }
     // Without coat and metal, roughness changes nothing: appendix B leaves exactly the Lambert part.
-    if metallic == 0.0 && strength == 0.0 {
+    if metallic == 0.0 && specular == 0.0 {
         return Ok(Surface::Diffuse);
     }
-    Ok(Surface::Gltf { metallic, roughness, specular, ior })
+    Ok(Surface::Gltf { metallic, roughness, specular, specular_color, ior })
 }
 
 fn emission(source: &Source, extensions: &Extensions) -> Result<Rgb, Fault> {

@@ -37,15 +37,16 @@ fn everything_else_is_metallic_roughness() {
             "KHR_materials_ior": {"ior": 1.33},
         },
     }));
-    let specular = Vec3::new(0.5, 0.25, 0.0);
-    assert_eq!(paint.surface, Surface::Gltf { metallic: 0.25, roughness: 0.5, specular, ior: 1.33 });
+    let specular_color = Vec3::new(1.0, 0.5, 0.0);
+    let expected = Surface::Gltf { metallic: 0.25, roughness: 0.5, specular: 0.5, specular_color, ior: 1.33 };
+    assert_eq!(paint.surface, expected);
     assert!(paint.double_sided);
 }
 
 #[test]
 fn a_primitive_without_material_has_the_default_one() {
     let scene = File::triangle().scene();
-    let expected = Surface::Gltf { metallic: 1.0, roughness: 1.0, specular: Vec3::ONE, ior: 1.5 };
+    let expected = Surface::Gltf { metallic: 1.0, roughness: 1.0, specular: 1.0, specular_color: Vec3::ONE, ior: 1.5 };
     assert_eq!((scene.materials[0].surface, scene.materials[0].color), (expected, Vec3::ONE));
 }
 
@@ -86,7 +87,6 @@ fn unsupported_materials_are_refused_by_name() {
         (json!({"emissiveTexture": texture}), "emissiveTexture"),
         (json!({"extensions": {"KHR_materials_specular": {"specularTexture": texture}}}), "specularTexture"),
         (json!({"extensions": {"KHR_materials_specular": {"specularColorTexture": texture}}}), "specularColorTexture"),
-        (json!({"extensions": {"KHR_materials_specular": {"specularColorFactor": [2, 1, 1]}}}), "specularColorFactor"),
         (json!({"extensions": {"KHR_materials_transmission": {}}}), "KHR_materials_transmission"),
         (json!({"extensions": {"KHR_materials_unlit": {}}}), "KHR_materials_unlit"),
         (json!({"extensions": {"KHR_materials_ior": {"ior": 0}}}), "ior is 0"),

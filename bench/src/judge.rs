@@ -1,5 +1,4 @@
-//! What the tests share: the scenes and references beside them, and the measure both are held to.
-#![allow(dead_code)]
+//! Scenes with references, and the measure pictures of them are held to.
 
 use std::path::{Path, PathBuf};
 
@@ -12,12 +11,15 @@ use worker::solo::{self, Order};
 /// Edge of the references in pixels.
 pub const SIZE: usize = 128;
 
-/// A file beside the tests.
+/// A file of the tests.
 pub fn file(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests").join(name)
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests").join(name)
 }
 
-/// A scene and its camera.
+/// A scene of `tests/scenes` and its camera.
+///
+/// # Panics
+/// If the file is missing or damaged: it belongs to the repository.
 pub fn load(name: &str) -> (Scene, Camera) {
     let path = file("scenes").join(name);
     let scene = scene::load(&path).unwrap_or_else(|e| panic!("{e}"));
@@ -44,11 +46,16 @@ pub fn render(scene: Scene, settings: Settings) -> Vec<[f64; 3]> {
 
 /// A reference picture with its standard error of luminance, pixel by pixel.
 pub struct Reference {
+    /// Linear RGB radiance, row by row.
     pub image: Vec<[f64; 3]>,
+    /// Standard error of each pixel's luminance.
     pub error: Vec<f64>,
 }
 
 /// Reads `tests/references/NAME.exr`, for instance "cornell.full".
+///
+/// # Panics
+/// If the file is missing or damaged: it belongs to the repository.
 pub fn reference(name: &str) -> Reference {
     let path = file("references").join(format!("{name}.exr"));
     let image = read_first_flat_layer_from_file(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
