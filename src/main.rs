@@ -42,6 +42,8 @@ enum Command {
     /// ambience:*. OUT.png is sRGB, exposed so that the 98th percentile of luminance shows at about 0.9.
     ///
     /// Exit codes: 0 done; 2 wrong usage or input; 1 everything else; 130 after Ctrl-C, 143 after SIGTERM.
+    // The last of a repeated option counts, so that scripts can append to a line of defaults.
+    #[command(args_override_self = true)]
     Render(args::RenderArgs),
     /// Keep and share records, and give out work
     Serve {
