@@ -4,7 +4,7 @@ use cache_core::hemisphere::Strata;
 use cache_core::id::{Origin, Random};
 use cache_core::math::Frame;
 use cache_core::{Cached, Irradiance, Namespace};
-use glam::Vec2;
+use glam::{Vec2, Vec3};
 
 use crate::frame::Counts;
 use crate::sampler::Sampler;
@@ -63,7 +63,8 @@ impl Gather<'_> {
             radius: estimate.radius.clamp(f32::MIN_POSITIVE, 4.0 * self.tracer.world.radius),
             radius_min,
             radius_max,
-            irradiance: estimate.irradiance,
+            // A coat's share is negative: by noise a dark sum can be, too.
+            irradiance: estimate.irradiance.max(Vec3::ZERO),
             gradient_t: estimate.gradient_t.map(own),
             gradient_r: estimate.gradient_r.map(own),
         }

@@ -182,7 +182,8 @@ impl Tracer<'_> {
                 return Sample { radiance: Rgb::ZERO, distance: f32::INFINITY };
             }
             let seen = self.see((at.leave(direction), direction), depth + 1, Chance::Gathered, sampler, counts);
-            Sample { radiance: seen.total().max(Rgb::ZERO), distance: seen.distance }
+            // Nothing is so near that its inverse overflows.
+            Sample { radiance: seen.total(), distance: seen.distance.max(1e-30) }
         };
         (0..strata.rays()).map(&mut ray).collect()
     }
