@@ -14,10 +14,10 @@ use crate::failure::Failure;
 mod defaults {
     /// Rows of the picture; its width follows from the camera.
     pub const HEIGHT: u32 = 512;
-    pub const SPP: u32 = 16;
+    pub const SPP: u32 = 32;
     pub const METHOD: &str = "auto";
     pub const A: f32 = 0.3;
-    pub const RAYS: u32 = 1024;
+    pub const RAYS: u32 = 2048;
     pub const BOUNCES: &str = "all";
     pub const SEED: u64 = 0;
     pub const THREADS: u16 = 1;
@@ -235,7 +235,7 @@ mod tests {
     fn defaults_are_those_of_the_help() {
         let settings = args(&[]).settings(&scene()).expect("sound");
         let expected = (libm::tanf(0.5) / libm::tanf(0.25) * 512.0).round() as u32;
-        assert_eq!((settings.width, settings.height, settings.spp), (expected, 512, 16));
+        assert_eq!((settings.width, settings.height, settings.spp), (expected, 512, 32));
         assert_eq!((settings.method, settings.rays, settings.bounces), (Method::Irradiance, 1024, ALL_BOUNCES));
         assert_eq!(settings.camera.name, "front");
     }
