@@ -4,24 +4,11 @@ use std::path::{Path, PathBuf};
 
 use worker::client::Address;
 use worker::scene::{self, Camera, Scene};
-use worker::settings::{ALL_BOUNCES, Method, Settings};
+use worker::settings::{ALL_BOUNCES, Method, Settings, defaults};
 use worker::{film, spec};
 
 use crate::children::Transport;
 use crate::failure::Failure;
-
-/// Every default of `render`.
-mod defaults {
-    /// Rows of the picture; its width follows from the camera.
-    pub const HEIGHT: u32 = 512;
-    pub const SPP: u32 = 32;
-    pub const METHOD: &str = "auto";
-    pub const A: f32 = 0.3;
-    pub const RAYS: u32 = 2048;
-    pub const BOUNCES: &str = "all";
-    pub const SEED: u64 = 0;
-    pub const THREADS: u16 = 1;
-}
 
 /// Renders a picture.
 #[derive(Clone, Debug, clap::Args)]
@@ -43,7 +30,7 @@ pub struct RenderArgs {
           default_value_t = defaults::SPP)]
     pub spp: u32,
     /// How indirect light is computed; auto is irradiance
-    #[arg(long, value_name = "M", value_parser = ["auto", "irradiance", "path"], default_value = defaults::METHOD)]
+    #[arg(long, value_name = "M", value_parser = ["auto", "irradiance", "path"], default_value = "auto")]
     pub method: String,
     /// Allowed interpolation error of a record (Ward 1988): smaller is slower and more accurate
     #[arg(long, value_name = "A", value_parser = allowed_error, default_value_t = defaults::A)]
@@ -53,7 +40,7 @@ pub struct RenderArgs {
           default_value_t = defaults::RAYS)]
     pub rays: u32,
     /// Indirect bounces: a number, or all
-    #[arg(long, value_name = "N", value_parser = bounces, default_value = defaults::BOUNCES)]
+    #[arg(long, value_name = "N", value_parser = bounces, default_value = "all")]
     pub bounces: u32,
     /// Another number gives another, equally good, picture
     #[arg(long, value_name = "N", default_value_t = defaults::SEED)]
@@ -63,7 +50,7 @@ pub struct RenderArgs {
     pub workers: Option<u16>,
     /// Threads of each worker started here
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=64),
-          default_value_t = defaults::THREADS)]
+          default_value_t = 1)]
     pub threads: u16,
     /// Use this server, and the workers connected to it: HOST:PORT or unix:PATH
     #[arg(long, value_name = "ADDR")]
@@ -235,8 +222,11 @@ mod tests {
     fn defaults_are_those_of_the_help() {
         let settings = args(&[]).settings(&scene()).expect("sound");
         let expected = (libm::tanf(0.5) / libm::tanf(0.25) * 512.0).round() as u32;
-        assert_eq!((settings.width, settings.height, settings.spp), (expected, 512, 32));
-        assert_eq!((settings.method, settings.rays, settings.bounces), (Method::Irradiance, 1024, ALL_BOUNCES));
+        assert_eq!((settings.width, settings.height, settings.spp), (expected, defaults::HEIGHT, defaults::SPP));
+        assert_eq!(
+            (settings.method, settings.rays, settings.bounces),
+            (Method::Irradiance, defaults::RAYS, ALL_BOUNCES)
+        );
         assert_eq!(settings.camera.name, "front");
     }
 

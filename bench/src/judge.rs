@@ -95,10 +95,10 @@ pub fn judge(image: &[[f64; 3]], reference: &Reference) -> Verdict {
         let (x0, y0) = (block % (SIZE / 8) * 8, block / (SIZE / 8) * 8);
         let inside: Vec<usize> = (0..64).map(|k| (y0 + k / 8) * SIZE + x0 + k % 8).filter(|i| !hot[*i]).collect();
         if inside.len() > 32 {
-            for c in 0..3 {
-                let sum: f64 = inside.iter().map(|&i| image[i][c] - reference.image[i][c]).sum();
-                worst = worst.max((sum / inside.len() as f64).abs());
-            }
+            let sums = inside.iter().fold([0.0; 3], |sums: [f64; 3], &i| {
+                std::array::from_fn(|c| sums[c] + image[i][c] - reference.image[i][c])
+            });
+            worst = sums.map(|sum| (sum / inside.len() as f64).abs()).into_iter().fold(worst, f64::max);
         }
     }
     Verdict {

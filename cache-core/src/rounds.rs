@@ -16,15 +16,20 @@ const RANK_BITS: u32 = 6;
 /// Each round of the first pass ends at this many times the ranks tested before it.
 const GROWTH: f32 = 1.25;
 
-/// Rounds in each later pass: it only fills holes, those clamping tore and those seen from elsewhere within the pixels.
-const LATER_ROUNDS: u32 = 8;
+/// Points looked at in each pixel for level 1, one a pass: the camera sees edges cross its pixels.
+const LOOKS: u32 = 4;
 
-/// Passes over level 1, which the camera sees. Each looks at another point of every pixel, so that none would ever be
-/// the last where edges cross the picture; what four leave uncovered is rare enough to be gathered sample by sample.
-const PASSES: u32 = 4;
+/// The same for a deeper level: a gather ray that meets a hole goes on as a path.
+const LOOKS_DEEPER: u32 = 2;
 
-/// Passes over a deeper level: a gather ray that meets a hole goes on as a path.
-const PASSES_DEEPER: u32 = 2;
+/// Rounds of a pass that looks where no pass has looked before, after the first.
+const ROUNDS_LATER: u32 = 8;
+
+/// Rounds of a pass that looks again: it only finds what clamping has uncovered since.
+const ROUNDS_AGAIN: u32 = 2;
+
+/// Passes before the plan gives up on a level's last holes; Krivanek 2006 needed at most 11.
+pub const PASSES_MAX: u32 = 16;
 
 /// Rank of a pixel: bits of x^y and y interleaved, finest differences first.
 pub fn rank(x: u32, y: u32) -> u32 {
@@ -38,7 +43,7 @@ pub enum Step {
     Fill {
         /// Level being filled, counted from the camera: 1, 2, ...
         level: u32,
-        /// Pass over the level, from 0.
+        /// Pass over the level, from 0. Each tests one point of every pixel: the [`look`] of its pass.
         pass: u32,
         /// Ranks whose candidates are tested.
         ranks: Range<u32>,
@@ -47,12 +52,24 @@ pub enum Step {
     Pixels,
 }
 
-/// Gives a frame's steps one after another: levels deepest first, each in passes until one gathers nothing or there were
-/// enough, then the pixels.
+/// Which point of its pixels a pass looks at: 0 their middle, 1 and so on others. After a round of looks it starts again,
+/// until every point is found covered.
+pub fn look(level: u32, pass: u32) -> u32 {
+    pass % looks(level)
+}
+
+fn looks(level: u32) -> u32 {
+    if level == 1 { LOOKS } else { LOOKS_DEEPER }
+}
+
+/// Gives a frame's steps one after another: levels deepest first, each in passes until every look in turn gathers
+/// nothing, then the pixels.
 #[derive(Clone, Debug)]
 pub struct Plan {
     level: u32,
     pass: u32,
+    /// Passes in a row that gathered nothing.
+    quiet: u32,
     from: u32,
     gathered: u64,
     done: bool,
@@ -61,7 +78,7 @@ pub struct Plan {
 impl Plan {
     /// A plan for `levels` levels of records (0: pixels only).
     pub fn new(levels: u32) -> Self {
-        Self { level: levels, pass: 0, from: 0, gathered: 0, done: false }
+        Self { level: levels, pass: 0, quiet: 0, from: 0, gathered: 0, done: false }
     }
 
     /// The next step, told how many records the previous one gathered (0 before the first); `None` when all is done.
@@ -70,9 +87,9 @@ impl Plan {
         if self.level > 0 && self.from == RANKS {
             self.from = 0;
             self.pass += 1;
-            let passes = if self.level == 1 { PASSES } else { PASSES_DEEPER };
-            if self.gathered == 0 || self.pass == passes {
-                self.pass = 0;
+            self.quiet = if self.gathered == 0 { self.quiet + 1 } else { 0 };
+            if self.quiet == looks(self.level) || self.pass == PASSES_MAX {
+                (self.pass, self.quiet) = (0, 0);
                 self.level -= 1;
             }
             self.gathered = 0;
@@ -88,7 +105,8 @@ impl Plan {
     fn round_end(&self) -> u32 {
         let end = match self.pass {
             0 => ((self.from as f32 * GROWTH) as u32).max(self.from + 1),
-            _ => self.from + RANKS / LATER_ROUNDS,
+            pass if pass < looks(self.level) => self.from + RANKS / ROUNDS_LATER,
+            _ => self.from + RANKS / ROUNDS_AGAIN,
         };
         end.min(RANKS)
     }
@@ -133,7 +151,7 @@ mod tests {
         assert_eq!(all.last(), Some(&Step::Pixels));
         let mut expected = vec![];
         for level in [2, 1] {
-            for pass in [0, 1] {
+            for pass in 0..1 + looks(level) {
                 let mut at = 0;
                 for step in &all {
                     if let Step::Fill { level: l, pass: p, ranks } = step
@@ -152,12 +170,17 @@ mod tests {
     }
 
     #[test]
-    fn a_level_ends_with_the_first_pass_that_gathers_nothing_or_gives_up() {
+    fn a_level_ends_when_every_look_gathers_nothing_or_gives_up() {
         assert_eq!(steps(0, |_| 0), [Step::Pixels]);
         let passes =
             |all: &[Step]| all.iter().filter(|s| matches!(s, Step::Fill { ranks, .. } if ranks.start == 0)).count();
-        assert_eq!(passes(&steps(1, |_| 0)), 1);
-        assert_eq!(passes(&steps(1, |_| 1)), PASSES as usize);
-        assert_eq!(passes(&steps(2, |_| 1)), (PASSES + PASSES_DEEPER) as usize);
+        assert_eq!(passes(&steps(1, |_| 0)), LOOKS as usize);
+        assert_eq!(passes(&steps(2, |_| 0)), (LOOKS + LOOKS_DEEPER) as usize);
+        assert_eq!(passes(&steps(1, |_| 1)), PASSES_MAX as usize);
+        // A hole found in the sixth pass asks for another turn of all looks.
+        let found = |step: &Step| u64::from(matches!(step, Step::Fill { pass: 5, .. }));
+        assert_eq!(passes(&steps(1, found)), LOOKS as usize);
+        let found = |step: &Step| u64::from(matches!(step, Step::Fill { pass: 0 | 2 | 5, .. }));
+        assert_eq!(passes(&steps(1, found)), 6 + LOOKS as usize);
     }
 }

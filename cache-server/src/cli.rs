@@ -49,5 +49,6 @@ pub async fn run(args: ServeArgs) -> Result<(), ServeError> {
 /// Sends logs to stderr, as much as RUST_LOG says (default: info). For programs, once; libraries only log.
 pub fn log_to_stderr() {
     let filter = EnvFilter::builder().with_default_directive(LevelFilter::INFO.into()).from_env_lossy();
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    let colored = std::io::IsTerminal::is_terminal(&std::io::stderr());
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(colored).init();
 }

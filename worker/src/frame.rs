@@ -153,13 +153,14 @@ impl Frame {
         Tracer { world: &self.world, lights: &self.lights, levels, bounces, cached, regather: None }
     }
 
-    /// The candidate of a pixel: the diffuse surface where a path from its middle has its `level`th meeting.
+    /// The candidate of a pixel: the diffuse surface where a path through it has its `level`th meeting.
     fn site(&self, level: u32, pass: u32, x: u32, y: u32, counts: &mut Counts) -> Option<Site> {
         let s = &self.settings;
-        let mut sampler =
-            Sampler::Stream(Random::named("walk", &[s.seed, x.into(), y.into(), level.into(), pass.into()]));
-        // The first pass looks at the middle of each pixel, later ones elsewhere: what only edges see is found too.
-        let within = if pass == 0 { [0.5; 4] } else { sampler.next4() };
+        let look = rounds::look(level, pass);
+        let name = [s.seed, x.into(), y.into(), level.into(), look.into()];
+        let mut sampler = Sampler::Stream(Random::named("walk", &name));
+        // The first look is at the middle of each pixel, others elsewhere: what only edges see is found too.
+        let within = if look == 0 { [0.5; 4] } else { sampler.next4() };
         let (mut origin, mut direction) = s.ray(x as f32 + within[0], y as f32 + within[1]);
         let mut way = 0.0;
         for depth in 1.. {

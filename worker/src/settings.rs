@@ -32,6 +32,20 @@ impl Method {
     }
 }
 
+/// The defaults of every picture: what they reach is charted in the README.
+pub mod defaults {
+    /// Rows of the picture.
+    pub const HEIGHT: u32 = 512;
+    /// Samples a pixel.
+    pub const SPP: u32 = 32;
+    /// Allowed interpolation error a.
+    pub const A: f32 = 0.3;
+    /// Rays in one gather.
+    pub const RAYS: u32 = 2048;
+    /// Seed.
+    pub const SEED: u64 = 0;
+}
+
 /// `bounces` for "until Russian roulette ends the path".
 pub const ALL_BOUNCES: u32 = u32::MAX;
 
@@ -62,19 +76,18 @@ pub struct Settings {
 pub const TILE: u32 = 16;
 
 impl Settings {
-    /// The defaults, for a picture of `width` by `height` pixels: what they reach is charted in the README.
+    /// The defaults, for a picture of `width` by `height` pixels.
     pub fn new(camera: Camera, width: u32, height: u32) -> Self {
-        let camera = camera.with_aspect(width as f32 / height as f32);
         Self {
-            camera,
+            camera: camera.with_aspect(width as f32 / height as f32),
             width,
             height,
-            spp: 32,
+            spp: defaults::SPP,
             method: Method::Irradiance,
-            a: 0.3,
-            rays: 2048,
+            a: defaults::A,
+            rays: defaults::RAYS,
             bounces: ALL_BOUNCES,
-            seed: 0,
+            seed: defaults::SEED,
         }
     }
 
