@@ -22,8 +22,12 @@ pub const CHANNELS: usize = 13;
 /// Levels of records worth filling; deeper light continues as paths.
 const LEVELS_MAX: u32 = 3;
 
-/// Reach a record has at least, in pixels as projected at its site: level 1, and deeper levels.
-const REACH_MIN_PIXELS: [f32; 2] = [2.0, 6.0];
+/// Reach a record has at least, as a fraction of the picture's height projected at its site: level 1, deeper levels. A
+/// larger picture shows the same light with more pixels, it does not need more records.
+const REACH_MIN_HEIGHT: [f32; 2] = [1.0 / 128.0, 1.0 / 40.0];
+
+/// The same in pixels, for small pictures (course slides: 1.5 to 3).
+const REACH_MIN_PIXELS: [f32; 2] = [1.5, 4.0];
 
 /// Greatest over least reach (course slides: Radiance takes 64, Tabellion and Lamorlette 2004 about 7).
 const REACH_RATIO: f32 = 32.0;
@@ -169,7 +173,9 @@ impl Frame {
             way += at.distance;
             let bsdf = self.world.bsdf(&at)?;
             if depth == level {
-                let reach = REACH_MIN_PIXELS[usize::from(level > 1)] * s.pixel_size(way);
+                let deeper = usize::from(level > 1);
+                let pixels = (REACH_MIN_HEIGHT[deeper] * s.height as f32).max(REACH_MIN_PIXELS[deeper]);
+                let reach = pixels * s.pixel_size(way);
                 let radius_min = (reach / s.a).max(f32::MIN_POSITIVE);
                 let radius_bounds = (radius_min, radius_min * REACH_RATIO);
                 return (bsdf.diffuse() != Rgb::ZERO).then_some(Site { at, radius_bounds });
