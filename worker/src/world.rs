@@ -87,7 +87,10 @@ impl World {
 
     /// Whether something lies between two points that are already off their surfaces.
     pub fn hidden(&self, from: Vec3, to: Vec3) -> bool {
-        self.bvh.occluded(from, to - from, 1.0)
+        // By a unit direction: the tree takes components near 1e-7 for zero, which in a tiny scene would be all of them.
+        let way = to - from;
+        let length = way.length();
+        length > 0.0 && self.bvh.occluded(from, way / length, length)
     }
 
     /// Whether something lies in a direction.
@@ -153,4 +156,29 @@ fn blend(corners: &[Vec3; 3], weights: [f32; 3]) -> Vec3 {
 
 fn lift(triangle: &Triangle) -> f32 {
     LIFT * triangle.positions.iter().map(|p| p.abs().max_element()).fold(0.0, f32::max)
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec2;
+
+    use super::*;
+
+    /// Seen along slanted ways between points in front of and behind a small triangle, whatever the unit of length.
+    #[test]
+    fn tiny_surfaces_cast_shadows() {
+        for scale in (-20..40).map(|k| 0.5f32.powi(k)) {
+            let corners = [[-1.0, -1.0, 0.1], [2.0, -1.0, 0.0], [-1.0, 2.0, -0.1]].map(|c| Vec3::from(c) * scale);
+            let triangle = Triangle { positions: corners, normals: None, uvs: [Vec2::ZERO; 3], material: 0 };
+            let world = World::new(Scene { triangles: vec![triangle], ..Scene::default() });
+            for i in 0..100 {
+                let (x, y) = ((i % 10) as f32 * 0.05, (i / 10) as f32 * 0.05);
+                let (from, to) = (Vec3::new(x, -y, 0.4) * scale, Vec3::new(y, x, -0.3) * scale);
+                assert!(world.hidden(from, to) && world.hidden(to, from), "{scale}: {from} to {to}");
+                let beside = from + Vec3::X * (4.0 * scale);
+                assert!(!world.hidden(from, beside) && !world.hidden(beside, to + Vec3::X * (4.0 * scale)));
+            }
+            assert!(!world.hidden(Vec3::ONE * scale, Vec3::ONE * scale), "nothing lies between a point and itself");
+        }
+    }
 }
