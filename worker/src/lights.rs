@@ -171,7 +171,9 @@ impl Lights {
                     let cosine = (height / distance2.sqrt()).max(0.05);
                     if height > 0.0 { luminance(emission) * area * cosine / (distance2 + area) } else { 0.0 }
                 }
-                Light::Point(point) => luminance(point.intensity) / (point.position - from).length_squared().max(1e-12),
+                Light::Point(point) => {
+                    luminance(point.intensity) / (point.position - from).length_squared().max(f32::MIN_POSITIVE)
+                }
                 Light::Distant(light) if light.is_beam() => luminance(light.strength),
                 Light::Distant(light) => luminance(light.strength) * 2.0 * PI * (1.0 - light.cos_half_angle),
             };
@@ -179,8 +181,8 @@ impl Lights {
         shares.iter().sum()
     }
 
-    /// Density, by solid angle, of looking from `from` for the light of a triangle, where a ray along `direction` met it
-    /// at `distance`; 0 for light that is not sampled.
+    /// Density, by solid angle, of looking from `from` for the light of a triangle, where a ray from there along
+    /// `direction` met it at `distance`; 0 for light that is not sampled.
     pub fn pdf_triangle(&self, world: &World, triangle: u32, from: Vec3, direction: Vec3, distance: f32) -> f32 {
         let light = self.of_triangle[triangle as usize];
         if light == NONE {
@@ -194,23 +196,19 @@ impl Lights {
         self.chance(world, from, light) * density
     }
 
-    /// What a ray that meets nothing sees: for each distant light in that direction its radiance and its density, 0 for
-    /// light that is not sampled.
-    pub fn beyond<'a>(
-        &'a self,
-        world: &'a World,
-        from: Vec3,
-        direction: Vec3,
-    ) -> impl Iterator<Item = (Rgb, f32)> + 'a {
+    /// What a ray that meets nothing sees: the radiance of each distant light in that direction, and its number where
+    /// shadow rays look for it.
+    pub fn beyond<'a>(&'a self, world: &'a World, direction: Vec3) -> impl Iterator<Item = (Rgb, Option<u32>)> + 'a {
         let seen = move |d: &DistantLight| !d.is_beam() && direction.dot(d.to_light) >= d.cos_half_angle;
-        world.scene.distant.iter().zip(&self.of_distant).filter(move |(d, _)| seen(d)).map(move |(d, &light)| {
-            let pdf = if light == NONE {
-                0.0
-            } else {
-                self.chance(world, from, light) / (2.0 * PI * (1.0 - d.cos_half_angle))
-            };
-            (d.strength, pdf)
-        })
+        let sampled = |light: u32| (light != NONE).then_some(light);
+        let all = world.scene.distant.iter().zip(&self.of_distant);
+        all.filter(move |(d, _)| seen(d)).map(move |(d, &light)| (d.strength, sampled(light)))
+    }
+
+    /// Density, by solid angle, of looking from `from` for the light of this number, one of those of [`Self::beyond`].
+    pub fn pdf_distant(&self, world: &World, from: Vec3, light: u32) -> f32 {
+        let Light::Distant(distant) = self.lights[light as usize] else { return 0.0 };
+        self.chance(world, from, light) / (2.0 * PI * (1.0 - distant.cos_half_angle))
     }
 
     /// Chooses a light and a point on it by `u` in [0, 1)³, as seen from `from`; `None` when it does not shine there.

@@ -50,8 +50,13 @@ pub enum Chance {
     All,
     /// Only light that is gathered: the ray's origin has looked for the rest (gathers).
     Gathered,
-    /// Gathered light wholly, sampled light by the power heuristic against this density of the ray.
-    Weighed(f32),
+    /// Gathered light wholly, sampled light by the power heuristic against the density of the ray.
+    Weighed {
+        /// Density of the ray by solid angle, 1/sr.
+        density: f32,
+        /// Where lamps were looked for: their chances there count, not those where the ray starts, just off the surface.
+        from: Vec3,
+    },
 }
 
 /// What a ray brought back. Radiance in W/(sr m²).
@@ -86,8 +91,8 @@ impl Tracer<'_> {
             counts.path_rays += 1;
             let meeting = self.world.meet(origin, direction);
             let emitted = match &meeting {
-                Some(at) => self.emitted(at, origin, direction, chance),
-                None => self.beyond(origin, direction, chance),
+                Some(at) => self.emitted(at, direction, chance),
+                None => self.beyond(direction, chance),
             };
             seen.add(throughput * emitted, depth <= first + 1 && first == 1);
             let Some(at) = meeting else { break };
@@ -126,7 +131,10 @@ impl Tracer<'_> {
                 }
                 throughput /= survival;
             }
-            chance = if scatter.pdf.is_finite() { Chance::Weighed(scatter.pdf) } else { Chance::All };
+            chance = match scatter.pdf {
+                density if density.is_finite() => Chance::Weighed { density, from: at.position },
+                _ => Chance::All,
+            };
             (origin, direction) = (at.leave(incoming), incoming);
             depth += 1;
         }
@@ -215,7 +223,7 @@ impl Tracer<'_> {
         if hidden { Rgb::ZERO } else { light }
     }
 
-    fn emitted(&self, at: &Meeting, from: Vec3, direction: Vec3, chance: Chance) -> Rgb {
+    fn emitted(&self, at: &Meeting, direction: Vec3, chance: Chance) -> Rgb {
         let emission = self.world.emission(at);
         if emission == Rgb::ZERO {
             return emission;
@@ -230,20 +238,24 @@ impl Tracer<'_> {
                     emission
                 }
             }
-            Chance::Weighed(own) => {
-                emission
-                    * heuristic(own, self.lights.pdf_triangle(self.world, at.triangle, from, direction, at.distance))
+            Chance::Weighed { density, from } => {
+                let looked = self.lights.pdf_triangle(self.world, at.triangle, from, direction, at.distance);
+                emission * heuristic(density, looked)
             }
         }
     }
 
-    fn beyond(&self, from: Vec3, direction: Vec3, chance: Chance) -> Rgb {
-        let share = |pdf: f32| match chance {
-            Chance::All => 1.0,
-            Chance::Gathered => f32::from(pdf == 0.0),
-            Chance::Weighed(own) => heuristic(own, pdf),
-        };
-        self.lights.beyond(self.world, from, direction).map(|(radiance, pdf)| radiance * share(pdf)).sum()
+    fn beyond(&self, direction: Vec3, chance: Chance) -> Rgb {
+        self.lights
+            .beyond(self.world, direction)
+            .map(|(radiance, light)| match (chance, light) {
+                (Chance::Weighed { density, from }, Some(light)) => {
+                    radiance * heuristic(density, self.lights.pdf_distant(self.world, from, light))
+                }
+                (Chance::Gathered, Some(_)) => Rgb::ZERO,
+                _ => radiance,
+            })
+            .sum()
     }
 }
 

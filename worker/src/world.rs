@@ -87,7 +87,10 @@ impl World {
 
     /// Whether something lies between two points that are already off their surfaces.
     pub fn hidden(&self, from: Vec3, to: Vec3) -> bool {
-        self.bvh.occluded(from, to - from, 1.0)
+        // By a unit direction: the tree takes components near 1e-7 for zero, which in a tiny scene would be all of them.
+        let way = to - from;
+        let length = way.length();
+        length > 0.0 && self.bvh.occluded(from, way / length, length)
     }
 
     /// Whether something lies in a direction.
@@ -153,4 +156,24 @@ fn blend(corners: &[Vec3; 3], weights: [f32; 3]) -> Vec3 {
 
 fn lift(triangle: &Triangle) -> f32 {
     LIFT * triangle.positions.iter().map(|p| p.abs().max_element()).fold(0.0, f32::max)
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec2;
+
+    use super::*;
+
+    #[test]
+    fn tiny_surfaces_cast_shadows() {
+        for scale in (0..40).map(|k| 0.5f32.powi(k)) {
+            let corners = [[4.0, 1.3, 0.4], [3.9, 1.7, 0.4], [4.1, 1.5, 0.7]].map(|c| Vec3::from(c) * scale);
+            let triangle = Triangle { positions: corners, normals: None, uvs: [Vec2::ZERO; 3], material: 0 };
+            let world = World::new(Scene { triangles: vec![triangle], ..Scene::default() });
+            let (from, to, beside) = (Vec3::ZERO, Vec3::new(8.0, 3.0, 1.0) * scale, Vec3::new(8.0, 1.0, 1.0) * scale);
+            assert!(world.hidden(from, to) && world.hidden(to, from), "{scale}");
+            assert!(!world.hidden(from, beside) && !world.hidden(beside, to), "{scale}");
+            assert!(!world.hidden(to, to), "nothing lies between a point and itself");
+        }
+    }
 }
