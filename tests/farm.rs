@@ -170,7 +170,7 @@ fn alive(pid: u32) -> bool {
         .is_ok_and(|s| !s.rsplit(") ").next().unwrap_or("").starts_with('Z'))
 }
 
-/// The same parts by hand: a server, two workers of their own binaries' libraries, and a render that uses them.
+/// The same parts by hand: a server, two workers, and two renders that use them one after the other.
 #[test]
 fn server_and_workers_started_by_hand_give_the_same_picture() {
     let directory = tempfile::tempdir().expect("temporary directory");
@@ -198,4 +198,5 @@ fn server_and_workers_started_by_hand_give_the_same_picture() {
     assert_eq!(shared.stats["digest"], alone.stats["digest"]);
     assert!(shared.exr == alone.exr, "another picture");
     assert_eq!(again.stats["digest"], alone.stats["digest"], "the second frame added records");
+    assert!(again.exr == alone.exr, "another picture from the records of the first");
 }
