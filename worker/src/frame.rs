@@ -170,7 +170,8 @@ impl Frame {
             let bsdf = self.world.bsdf(&at)?;
             if depth == level {
                 let reach = REACH_MIN_PIXELS[usize::from(level > 1)] * s.pixel_size(way);
-                let radius_min = (reach / s.a).max(f32::MIN_POSITIVE);
+                // From far away, or with a tiny `a`, everything is nearer than that.
+                let radius_min = (reach / s.a).clamp(f32::MIN_POSITIVE, 4.0 * self.world.radius);
                 let radius_bounds = (radius_min, radius_min * REACH_RATIO);
                 return (bsdf.diffuse() != Rgb::ZERO).then_some(Site { at, radius_bounds });
             }
