@@ -90,10 +90,17 @@ impl RenderArgs {
         if !ending {
             return Err(Failure::usage(format!("--output {}: expected a name ending in .exr", self.output.display())));
         }
-        for (path, option) in [(Some(&self.output), "--output"), (self.stats.as_ref(), "--stats")] {
-            if let Some(path) = path {
-                film::check_writable(path).map_err(|e| Failure::usage(format!("{option} {e}")))?;
+        let mut taken = vec![identity(&self.scene)];
+        for (path, option) in
+            [(Some(&self.output), "--output"), (Some(&self.png()), "--output"), (self.stats.as_ref(), "--stats")]
+        {
+            let Some(path) = path else { continue };
+            film::check_writable(path).map_err(|e| Failure::usage(format!("{option} {e}")))?;
+            if taken.contains(&identity(path)) {
+                let path = path.display();
+                return Err(Failure::usage(format!("{option} {path}: is the scene or another file to be written")));
             }
+            taken.push(identity(path));
         }
         Ok(())
     }
@@ -158,6 +165,15 @@ impl RenderArgs {
             Failure::usage(format!("{scene} has no camera: name a view file with --camera FILE.vf"))
         })
     }
+}
+
+/// The same for all names of one file, which need not be there yet.
+fn identity(path: &Path) -> PathBuf {
+    let whole = |path: &Path| std::fs::canonicalize(if path.as_os_str().is_empty() { Path::new(".") } else { path });
+    whole(path).unwrap_or_else(|_| match (path.parent().map(whole), path.file_name()) {
+        (Some(Ok(folder)), Some(name)) => folder.join(name),
+        _ => path.to_path_buf(),
+    })
 }
 
 /// The cameras there are, in words.

@@ -6,6 +6,7 @@ use serde_json::json;
 use worker::{compare, film};
 
 use crate::failure::Failure;
+use crate::say;
 
 /// Arguments of `compare`.
 #[derive(Clone, Debug, clap::Args)]
@@ -40,12 +41,10 @@ pub fn run(args: &CompareArgs) -> Result<(), Failure> {
             "worst_block_at": [x, y],
             "size": [width, height],
         });
-        println!("{object}");
-    } else {
-        println!("size           {width}x{height}");
-        println!("relative RMSE  {:.5}", found.relative_rmse);
-        println!("bias           {:+.5}", found.bias);
-        println!("worst block    {:.5} at x {x}, y {y}", found.worst_block);
+        return say::result(object);
     }
-    Ok(())
+    say::result(format_args!(
+        "size           {width}x{height}\nrelative RMSE  {:.5}\nbias           {:+.5}\nworst block    {:.5} at x {x}, y {y}",
+        found.relative_rmse, found.bias, found.worst_block
+    ))
 }

@@ -2,7 +2,7 @@
 //!
 //! - [`args`], [`render`], [`children`], [`progress`], [`stats`]: `render`.
 //! - [`compare`]: `compare`. `serve` and `worker` run the libraries `cache-server` and `worker`.
-//! - [`parent`]: children end with their parent. [`failure`]: exit codes.
+//! - [`parent`]: children end with their parent. [`failure`]: exit codes. [`say`]: stdout and stderr.
 
 use std::process::ExitCode;
 use std::time::Duration;
@@ -17,6 +17,7 @@ mod failure;
 mod parent;
 mod progress;
 mod render;
+mod say;
 mod stats;
 
 use failure::Failure;
@@ -113,7 +114,7 @@ fn end(ended: Result<(), Failure>) -> ExitCode {
     match ended {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("ambience: {failure}");
+            say::line(&failure);
             ExitCode::from(failure.exit_code())
         }
     }

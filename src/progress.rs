@@ -6,6 +6,8 @@ use cache_core::rounds::RANKS;
 use cache_proto::v1;
 use indicatif::{HumanDuration, ProgressBar, ProgressStyle};
 
+use crate::say;
+
 /// Between two lines where there is no terminal.
 const LINES: Duration = Duration::from_secs(5);
 
@@ -92,7 +94,7 @@ impl Progress {
                 *last = now;
                 let left = left.map_or(String::new(), |l| format!(", {} s left in this phase", l.as_secs()));
                 let share = share.map_or(String::new(), |s| format!(", {:.0} %", s * 100.0));
-                eprintln!("ambience: {text}{share}{left}");
+                say::line(format_args!("{text}{share}{left}"));
             }
             _ => {}
         }
@@ -101,8 +103,8 @@ impl Progress {
     /// Prints a line that stays.
     pub fn note(&self, line: &str) {
         match &self.shown {
-            Shown::Bar(bar) => bar.suspend(|| eprintln!("ambience: {line}")),
-            _ => eprintln!("ambience: {line}"),
+            Shown::Bar(bar) => bar.suspend(|| say::line(line)),
+            _ => say::line(line),
         }
     }
 

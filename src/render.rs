@@ -20,6 +20,7 @@ use crate::args::RenderArgs;
 use crate::children::{Children, Event, how};
 use crate::failure::Failure;
 use crate::progress::{Progress, phase_name};
+use crate::say;
 use crate::stats::{Stats, hex};
 
 /// Own processes that died and are started again, all together.
@@ -324,16 +325,16 @@ impl Render<'_> {
             self.progress.note(&format!("warning: the picture is black: {}", why_black(job)));
         }
         self.progress.finish();
-        if !self.args.quiet {
-            println!(
-                "{} and {}: {seconds:.1} s, {} records, {} rounds",
-                self.args.output.display(),
-                self.args.png().display(),
-                done.records,
-                done.rounds
-            );
+        if self.args.quiet {
+            return Ok(());
         }
-        Ok(())
+        say::result(format_args!(
+            "{} and {}: {seconds:.1} s, {} records, {} rounds",
+            self.args.output.display(),
+            self.args.png().display(),
+            done.records,
+            done.rounds
+        ))
     }
 }
 

@@ -52,6 +52,13 @@ fn wrong_usage_is_one_line() {
     with(&["--error", "0.02"], &["--error", "not available yet"]);
     with(&["--cache", "somewhere"], &["--cache", "not available yet"]);
     with(&["--server", "nonsense"], &["nonsense"]);
+    with(&["--stats", &out], &["--stats", "out.exr", "another file"]);
+    with(&["--stats", &out.replace(".exr", ".png")], &["--stats", "out.png", "another file"]);
+    with(&["--stats", &cornell], &["--stats", "cornell.glb", "is the scene"]);
+    let folder = directory.path().join("folder.png");
+    std::fs::create_dir(&folder).expect("folder");
+    with(&["-o", &folder.with_extension("exr").display().to_string()], &["folder.png", "is a directory"]);
+    std::fs::remove_dir(&folder).expect("empty folder");
     assert!(std::fs::read_dir(directory.path()).expect("directory").next().is_none(), "something was left");
 }
 
@@ -123,4 +130,47 @@ fn compare_prints_error_bias_and_worst_block() {
         assert!(other[field].as_f64().is_some_and(|v| v != 0.0), "{field}: {other}");
     }
     refused(&["compare", &a, "missing.exr"], &["missing.exr"]);
+    refused(&["compare", &a, "/dev/zero"], &["/dev/zero", "not a file"]);
+}
+
+/// Pipes whose reader is gone, and files on a full disk.
+#[test]
+#[cfg(target_os = "linux")]
+fn output_nobody_reads_is_no_panic() {
+    let directory = tempfile::tempdir().expect("temporary directory");
+    let out = directory.path().join("out.exr").display().to_string();
+    let path = lit(directory.path());
+    let render = ["render", &path, "-o", &out, "--size", "8x8", "--spp", "1", "--rays", "16"];
+    let closed = || Stdio::from(std::io::pipe().expect("pipe").1);
+    let full = || Stdio::from(std::fs::OpenOptions::new().write(true).open("/dev/full").expect("/dev/full"));
+    let code = |args: &[&str], stdout: Stdio, stderr: Stdio| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_ambience"));
+        command.args(args).stdin(Stdio::null()).stdout(stdout).stderr(stderr).status().expect("ambience starts").code()
+    };
+    assert_eq!(code(&render, closed(), closed()), Some(0));
+    let compare = ["compare", &out, &out];
+    assert_eq!(code(&compare, closed(), closed()), Some(0));
+    assert_eq!(code(&["compare", &out, "missing.exr"], closed(), full()), Some(2));
+    for args in [&render[..], &compare] {
+        assert_eq!(code(args, full(), Stdio::null()), Some(1), "{args:?}");
+    }
+}
+
+/// A record's reach in proportion to pixels must not exceed any scene.
+#[test]
+fn a_tiny_allowed_error_is_rendered() {
+    let directory = tempfile::tempdir().expect("temporary directory");
+    let out = directory.path().join("out.exr").display().to_string();
+    let path = lit(directory.path());
+    let args = ["render", &path, "-o", &out, "--size", "8x8", "--spp", "1", "--rays", "16", "--quiet", "--a", "1e-30"];
+    let output = ambience(&args);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+/// A ball under an even sky, and its view beside it.
+fn lit(directory: &Path) -> String {
+    scene(directory, "lit.vf", VIEW);
+    let ball = "void plastic p\n0\n0\n5 .5 .5 .5 0 0\np sphere s\n0\n0\n4 0 0 0 1\n";
+    let sky = "void glow g\n0\n0\n4 1 1 1 0\ng source sky\n0\n0\n4 0 1 0 360\n";
+    scene(directory, "lit.rad", &format!("{ball}{sky}"))
 }

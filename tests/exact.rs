@@ -176,7 +176,7 @@ fn a_beam_lights_by_the_cosine_and_not_from_below() {
 fn discs_of_the_sky_give_their_projected_solid_angle() {
     for kind in ["light", "glow"] {
         for (angle, tilt) in [(0.2, 0.7), (0.5, 0.0), (0.5, 1.2), (3.0, 1.0), (10.0, 0.7), (60.0, 0.9)] {
-            let (half, radiance) = (f64::to_radians(angle / 2.0), 10.0 / f64::from(angle));
+            let (half, radiance) = (f64::to_radians(angle / 2.0), 10.0 / angle);
             if kind == "glow" && angle < 50.0 {
                 // Gathers would have to meet so small a glow by chance.
                 continue;
@@ -287,7 +287,7 @@ fn a_mirror_shows_the_lamp_times_its_reflectance() {
         // The camera looks down along +x; the lamp stands behind the mirror point and faces back.
         let wall = [[3.0, -9.0], [3.0, 9.0], [9.0, 9.0], [9.0, -9.0]].map(|[y, z]| Vec3::new(4.0, y - 3.0, z));
         add_quad(&mut scene, wall, 1);
-        let back: Vec<_> = scene.triangles[2..].iter().map(|t| worker::world::facet(t)).collect();
+        let back: Vec<_> = scene.triangles[2..].iter().map(worker::world::facet).collect();
         assert!(back.iter().all(|n| n.x < -0.9), "{back:?}");
         only("mirror", &scene, slanted(0.8, 0.5), 4, 4.0 * reflectance, 1e-6..1e-6);
     }
@@ -494,10 +494,12 @@ fn the_unit_of_length_and_the_origin_do_not_matter() {
             picture_and_records(scene, Settings { method, spp: 16, ..settings(camera) })
         };
         let (metres, records) = shot(1.0, Vec3::ZERO);
-        // What is a power of two times as large has the same bits; a record's random numbers come from its site, though.
+        // What is a power of two times as large has the same bits until squares underflow; a record's random numbers come from its site, though.
         let cases = [
             ("x 1024", 1024.0, Vec3::ZERO, 0.0),
             ("/ 1048576", 1.0 / 1_048_576.0, Vec3::ZERO, 0.0),
+            ("x 2^30", 30f32.exp2(), Vec3::ZERO, 0.0),
+            ("x 2^-30", (-30f32).exp2(), Vec3::ZERO, 1e-6),
             ("x 1000", 1000.0, Vec3::ZERO, 0.005),
             ("x 1e6", 1e6, Vec3::ZERO, 0.005),
             ("x 1000 + 1e4", 1000.0, Vec3::new(1e4, -1e4, 1e4), 0.005),

@@ -1,5 +1,6 @@
 //! `cache-server`: thin over the library; `ambience serve` runs the same code.
 
+use std::io::Write as _;
 use std::process::ExitCode;
 
 use cache_server::ServeArgs;
@@ -19,7 +20,8 @@ async fn main() -> ExitCode {
     match cache_server::run(cli.serve).await {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("cache-server: {error}");
+            // Nobody is left to tell if that fails.
+            drop(writeln!(std::io::stderr(), "cache-server: {error}"));
             ExitCode::from(error.exit_code())
         }
     }

@@ -292,6 +292,10 @@ pub struct Picture {
 pub fn read(path: &Path) -> Result<Picture, FilmError> {
     use exr::prelude::{ReadChannels as _, ReadLayers as _};
     let failed = |reason: String| FilmError::File { path: path.into(), reason };
+    // A device may never end.
+    if path.metadata().is_ok_and(|about| !about.is_file()) {
+        return Err(failed("is not a file; expected a picture".into()));
+    }
     let bytes = std::fs::read(path).map_err(|e| failed(e.to_string()))?;
     let reader = exr::prelude::read().no_deep_data().largest_resolution_level().all_channels().first_valid_layer();
     let image = reader.all_attributes().from_buffered(Cursor::new(bytes));

@@ -177,7 +177,8 @@ impl Frame {
                 let deeper = usize::from(level > 1);
                 let pixels = (REACH_MIN_HEIGHT[deeper] * s.height as f32).max(REACH_MIN_PIXELS[deeper]);
                 let reach = pixels * s.pixel_size(way);
-                let radius_min = (reach / s.a).max(f32::MIN_POSITIVE);
+                // From far away, or with a tiny `a`, everything is nearer than that.
+                let radius_min = (reach / s.a).clamp(f32::MIN_POSITIVE, 4.0 * self.world.radius);
                 let radius_bounds = (radius_min, radius_min * REACH_RATIO);
                 return (bsdf.diffuse() != Rgb::ZERO).then_some(Site { at, radius_bounds });
             }
