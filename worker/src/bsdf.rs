@@ -276,7 +276,6 @@ mod tests {
             surface,
             emission: Rgb::ZERO,
             double_sided: true,
-            sampled: true,
         }
     }
 

@@ -98,10 +98,10 @@ impl Feed {
             match end {
                 Ok(()) => debug!("the server ended the subscription"),
                 Err(status) if status.code() == Code::OutOfRange => {
-                    warn!("the server lost records, giving it back those here: {}", status.message());
-                    if let Err(status) = self.refill().await {
-                        debug!("refilling failed: {status}");
-                    }
+                    // Records of an interrupted frame would change the one begun in its place: follow the new log.
+                    warn!("the server lost its records, beginning anew: {}", status.message());
+                    *lock(&self.replica) = Replica::new(self.namespace);
+                    self.position.send_replace(0);
                 }
                 Err(status) => debug!("subscription ended: {status}"),
             }
@@ -127,13 +127,6 @@ impl Feed {
             self.position.send_replace(position);
         }
         Ok(())
-    }
-
-    /// Gives a server that has less than we do everything back. Its log then has another order, and the digest of the
-    /// next step shows that this replica must begin anew.
-    async fn refill(&mut self) -> Result<(), Status> {
-        let log = lock(&self.replica).log().to_vec();
-        insert(&mut self.cache, &self.namespace, &log).await.map(drop)
     }
 }
 

@@ -89,7 +89,7 @@ impl Lights {
         }
         for (i, distant) in scene.distant.iter().enumerate() {
             let disc = PI * world.radius * world.radius;
-            let broad = distant.cos_half_angle < BROAD_COSINE || !distant.sampled;
+            let broad = distant.cos_half_angle < BROAD_COSINE;
             if distant.is_beam() {
                 add(Light::Distant(*distant), luminance(distant.strength) * disc);
             } else if gather_broad && broad {
@@ -283,7 +283,7 @@ fn sampled_materials(world: &World, gather_broad: bool) -> Vec<bool> {
     }
     let total: f64 = areas.iter().sum();
     let broad = |area: f64| area >= f64::from(BROAD) * total;
-    scene.materials.iter().zip(areas).map(|(m, area)| m.sampled && !broad(area)).collect()
+    areas.into_iter().map(|area| !broad(area)).collect()
 }
 
 fn area(corners: &[Vec3; 3]) -> f32 {

@@ -67,9 +67,6 @@ pub struct Material {
     pub emission: Rgb,
     /// When false, the back face is black: it stops light and gives none.
     pub double_sided: bool,
-    /// When false, the material's light is never looked for by shadow rays and counts as indirect light (the `glow` of
-    /// Radiance); it makes no difference to a converged picture.
-    pub sampled: bool,
 }
 
 /// The reflection models.
@@ -161,8 +158,6 @@ pub struct DistantLight {
     pub cos_half_angle: f32,
     /// Radiance W/(sr m2) of the disc; for a parallel beam its irradiance W/m2 on a facing surface.
     pub strength: Rgb,
-    /// As `Material::sampled`.
-    pub sampled: bool,
 }
 
 impl DistantLight {
@@ -227,7 +222,7 @@ fn content_hash(scene: &Scene) -> [u8; 32] {
     for m in &scene.materials {
         add(&m.color.to_array());
         add(&m.emission.to_array());
-        add(&[f32::from_bits(m.texture.unwrap_or(u32::MAX)), f32::from(m.double_sided), f32::from(m.sampled)]);
+        add(&[f32::from_bits(m.texture.unwrap_or(u32::MAX)), f32::from(m.double_sided)]);
         match m.surface {
             Surface::Diffuse => add(&[0.0]),
             Surface::Gltf { metallic, roughness, specular, specular_color: c, ior } => {
@@ -253,7 +248,7 @@ fn content_hash(scene: &Scene) -> [u8; 32] {
     for d in &scene.distant {
         add(&d.to_light.to_array());
         add(&d.strength.to_array());
-        add(&[d.cos_half_angle, f32::from(d.sampled)]);
+        add(&[d.cos_half_angle]);
     }
     *hasher.finalize().as_bytes()
 }

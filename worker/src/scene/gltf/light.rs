@@ -38,7 +38,7 @@ fn add(light: &Light, place: &Placement, scene: &mut Scene) -> Result<(), Fault>
     }
     match light.type_ {
         Checked::Valid(Type::Directional) => {
-            scene.distant.push(DistantLight { to_light: -axis()?, cos_half_angle: 1.0, strength, sampled: true })
+            scene.distant.push(DistantLight { to_light: -axis()?, cos_half_angle: 1.0, strength })
         }
         Checked::Valid(Type::Point) => scene.points.push(PointLight { position, intensity: strength, spot: None }),
         Checked::Valid(Type::Spot) => {

@@ -99,7 +99,6 @@ impl<'a> Materials<'a> {
             surface,
             emission,
             double_sided: source.double_sided,
-            sampled: true,
         });
         Ok(texture.map(|info| info.tex_coord))
     }

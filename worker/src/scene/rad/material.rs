@@ -19,8 +19,6 @@ const SAME: f64 = 1e-6;
 pub(super) struct Matter {
     /// Radiance from the front, W/(sr m2).
     pub(super) emission: DVec3,
-    /// Whether shadow rays look for it: `light`, and `glow` with a positive radius.
-    pub(super) sampled: bool,
     /// `None`: nothing, as for all pure emitters.
     pub(super) reflection: Option<Reflection>,
 }
@@ -102,11 +100,7 @@ impl Matter {
             (Some(a), None) => Some(a.reflection()?),
             _ => None,
         };
-        Ok(Matter {
-            emission: self.emission * share + other.emission * (1.0 - share),
-            sampled: parts.iter().any(|(m, _)| m.emission != DVec3::ZERO && m.sampled),
-            reflection,
-        })
+        Ok(Matter { emission: self.emission * share + other.emission * (1.0 - share), reflection })
     }
 
     fn material(&self, name: &[u8]) -> Material {
@@ -130,7 +124,6 @@ impl Matter {
             surface,
             emission: self.emission.as_vec3(),
             double_sided: self.reflection.is_some(),
-            sampled: self.sampled,
         }
     }
 }
@@ -264,18 +257,16 @@ fn reflecting(statement: &Statement, warn: &mut dyn FnMut(String)) -> Result<Mat
         roughness: statement.reals[4],
         metal: statement.kind == b"metal",
     };
-    Ok(Matter { emission: DVec3::ZERO, sampled: false, reflection: Some(reflection) })
+    Ok(Matter { emission: DVec3::ZERO, reflection: Some(reflection) })
 }
 
 fn emitting(statement: &Statement) -> Result<Matter, SceneError> {
-    let sampled = if statement.kind == b"light" {
-        statement.needs_reals(3, "red green blue")?;
-        true
-    } else {
-        statement.needs_reals(4, "red green blue radius")?;
-        statement.reals[3] > 0.0
-    };
-    Ok(Matter { emission: rgb(statement)?, sampled, reflection: None })
+    // The radius of a glow says how Radiance looks for its light, not how much there is.
+    match statement.kind == b"light" {
+        true => statement.needs_reals(3, "red green blue")?,
+        false => statement.needs_reals(4, "red green blue radius")?,
+    }
+    Ok(Matter { emission: rgb(statement)?, reflection: None })
 }
 
 fn rgb(statement: &Statement) -> Result<DVec3, SceneError> {

@@ -3,7 +3,7 @@
 //! out without starting a program. Anything else is an error that names file and line: nothing is dropped silently.
 //!
 //! Lengths are the file's own, radiances W/(sr m2), angles degrees. `light` and `glow` emit from the front only, reflect
-//! nothing and are black behind; they differ in `Material::sampled`. Everything else reflects on both sides.
+//! nothing and are black behind: Radiance tells them apart only to choose how to look for them. Everything else reflects on both sides.
 
 mod lexer;
 mod material;

@@ -210,8 +210,7 @@ impl Shape<'_, '_> {
 /// Two things make up for 32-bit cosines. Below `BEAM` degrees of half angle the disc becomes a beam whose irradiance is
 /// radiance times the exact solid angle: 1 - cos has hardly any digits left there, and penumbras are too narrow to see.
 /// From there to `SMALL` the disc stays, for its penumbra (the sun has 0.27), and its radiance is scaled by the exact
-/// over the rounded solid angle, less than 1 %, so that what it lights is exact. A beam counts as sampled even when it
-/// glows, since no ray can hit it.
+/// over the rounded solid angle, less than 1 %, so that what it lights is exact.
 fn source(reader: &mut Reader, statement: &Statement, frame: &Frame, matter: usize) -> Result<(), SceneError> {
     statement.needs_reals(4, "direction angle")?;
     let to_light = frame
@@ -230,20 +229,15 @@ fn source(reader: &mut Reader, statement: &Statement, frame: &Frame, matter: usi
     // 1 - cos without cancellation.
     let exact = 2.0 * libm::sin(half.to_radians() / 2.0).powi(2);
     let cosine = (1.0 - exact) as f32;
-    let (cos_half_angle, strength, sampled) = if half < BEAM {
-        (1.0, radiance * (2.0 * PI * exact), true)
+    let (cos_half_angle, strength) = if half < BEAM {
+        (1.0, radiance * (2.0 * PI * exact))
     } else if half < SMALL {
-        (cosine, radiance * (exact / (1.0 - f64::from(cosine))), matter.sampled)
+        (cosine, radiance * (exact / (1.0 - f64::from(cosine))))
     } else {
         // A right angle must be the hemisphere exactly.
-        (if angle == 180.0 { 0.0 } else { cosine }, radiance, matter.sampled)
+        (if angle == 180.0 { 0.0 } else { cosine }, radiance)
     };
     let strength = strength.as_vec3();
-    reader.scene.distant.push(DistantLight {
-        to_light: to_light.as_vec3().normalize(),
-        cos_half_angle,
-        strength,
-        sampled,
-    });
+    reader.scene.distant.push(DistantLight { to_light: to_light.as_vec3().normalize(), cos_half_angle, strength });
     Ok(())
 }

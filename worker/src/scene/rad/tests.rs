@@ -85,9 +85,9 @@ fn materials_are_what_they_say() {
     assert_eq!((m[0].surface, m[0].color, m[0].double_sided), (Surface::Diffuse, Vec3::new(0.1, 0.2, 0.3), true));
     assert_eq!(m[1].surface, Surface::Plastic { specular: 0.04, roughness: 0.1 });
     assert_eq!(m[2].surface, Surface::Metal { specular: 1.0, roughness: 0.2 });
-    for (light, sampled) in [(&m[3], true), (&m[4], false), (&m[5], true)] {
+    for light in &m[3..6] {
         assert_eq!((light.emission, light.color), (Vec3::new(1.0, 2.0, 3.0), Vec3::ZERO));
-        assert_eq!((light.sampled, light.double_sided), (sampled, false));
+        assert!(!light.double_sided);
     }
 }
 
@@ -99,7 +99,7 @@ fn mixtures_mix_emission_and_reflection() {
     };
     let m = mixed("glow a 0 0 4 2 2 2 0", "plastic b 0 0 5 1 1 1 0 0", "0.25").unwrap();
     assert_eq!((m.emission, m.color, m.surface), (Vec3::splat(0.5), Vec3::splat(0.75), Surface::Diffuse));
-    assert!(m.double_sided && !m.sampled);
+    assert!(m.double_sided);
     let m = mixed("plastic a 0 0 5 .5 .5 .5 .1 .2", "plastic b 0 0 5 .3 .3 .3 0 0", "0.5").unwrap();
     assert_eq!(m.surface, Surface::Plastic { specular: 0.05, roughness: 0.2 });
     // Diffuse albedo: half of .45 and half of .3.
@@ -236,8 +236,8 @@ fn sources_light_exactly() {
     for (angle, cosine) in [("360", -1.0), ("180", 0.0), ("120", 0.5)] {
         let d = &scene(angle).distant;
         assert!((d[0].cos_half_angle - cosine).abs() < 1e-7, "{angle}");
-        assert_eq!((d[0].strength, d[0].to_light, d[0].sampled), (Vec3::new(3.0, 2.0, 1.0), Vec3::Z, true));
-        assert_eq!((d[1].to_light, d[1].sampled), (Vec3::Y, false));
+        assert_eq!((d[0].strength, d[0].to_light), (Vec3::new(3.0, 2.0, 1.0), Vec3::Z));
+        assert_eq!(d[1].to_light, Vec3::Y);
     }
     assert_eq!(scene("180").distant[0].cos_half_angle, 0.0);
     let beam = scene("0.1").distant[0];

@@ -23,7 +23,7 @@ fn without_coat_and_metal_a_material_is_lambert() {
     let paint = material(diffuse(json!({"pbrMetallicRoughness": {"baseColorFactor": [0.1, 0.2, 0.3, 1]}})));
     assert_eq!(paint.surface, Surface::Diffuse);
     assert_eq!(paint.color, Vec3::new(0.1, 0.2, 0.3));
-    assert_eq!((paint.name.as_str(), paint.double_sided, paint.sampled, paint.texture), ("paint", false, true, None));
+    assert_eq!((paint.name.as_str(), paint.double_sided, paint.texture), ("paint", false, None));
     assert_eq!(paint.emission, Vec3::ZERO);
 }
 
@@ -58,7 +58,6 @@ fn emitters_reflect_too() {
         "extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": 8}},
     })));
     assert_eq!((paint.emission, paint.color), (Vec3::new(8.0, 4.0, 2.0), Vec3::splat(0.5)));
-    assert!(paint.sampled);
 }
 
 #[test]
