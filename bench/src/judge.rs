@@ -44,6 +44,22 @@ pub fn render(scene: Scene, settings: Settings) -> Vec<[f64; 3]> {
     pixels.chunks_exact(CHANNELS).map(|p| [p[0].into(), p[1].into(), p[2].into()]).collect()
 }
 
+/// Averages a square picture down to the references' size.
+///
+/// # Panics
+/// Unless its edge is a multiple of [`SIZE`].
+pub fn reduce(image: &[[f64; 3]]) -> Vec<[f64; 3]> {
+    let edge = image.len().isqrt();
+    assert!(edge * edge == image.len() && edge % SIZE == 0, "a square picture of a multiple of {SIZE} pixels");
+    let factor = edge / SIZE;
+    let mut small = vec![[0.0; 3]; SIZE * SIZE];
+    for (i, pixel) in image.iter().enumerate() {
+        let at = &mut small[i / edge / factor * SIZE + i % edge / factor];
+        *at = std::array::from_fn(|c| at[c] + pixel[c] / (factor * factor) as f64);
+    }
+    small
+}
+
 /// A reference picture with its standard error of luminance, pixel by pixel.
 pub struct Reference {
     /// Linear RGB radiance, row by row.

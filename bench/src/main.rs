@@ -1,11 +1,12 @@
 //! Speed against accuracy: every method at several settings, on the scenes with references, one thread.
 //!
-//! `cargo run --release -p ambience-bench [SCENE.DEPTH ...]` prints one line a setting; without arguments it takes the
-//! scenes of the README. Seconds are those of one thread, filling and pixels together, loading apart.
+//! `cargo run --release -p ambience-bench [EDGE] [SCENE.DEPTH ...]` prints one line a setting; without arguments it takes
+//! the scenes of the README at 128 x 128. Larger pictures (EDGE a multiple of 128) are averaged down before they are
+//! judged. Seconds are those of one thread, filling and pixels together, loading apart.
 
 use std::time::Instant;
 
-use ambience_bench::judge::{SIZE, judge, load, reference, settings};
+use ambience_bench::judge::{SIZE, judge, load, reduce, reference, settings};
 use worker::frame::{CHANNELS, Frame};
 use worker::settings::{Method, Settings};
 use worker::solo::{self, Order};
@@ -13,9 +14,15 @@ use worker::solo::{self, Order};
 const SCENES: [&str; 5] = ["cornell.full", "stairs.full", "leak.full", "sphere-plane.one", "glossy-floor.full"];
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let asked: Vec<String> = std::env::args().skip(1).collect();
+    let mut asked: Vec<String> = std::env::args().skip(1).collect();
+    let edge = match asked.first().and_then(|first| first.parse::<u32>().ok()) {
+        Some(edge) if edge > 0 && edge as usize % SIZE == 0 => edge,
+        Some(edge) => return Err(format!("{edge}: expected a multiple of {SIZE}").into()),
+        None => SIZE as u32,
+    };
+    asked.retain(|a| a.parse::<u32>().is_err());
     let names: Vec<&str> = if asked.is_empty() { SCENES.to_vec() } else { asked.iter().map(String::as_str).collect() };
-    println!("{SIZE}x{SIZE}, one thread; errors relative to the reference's mean");
+    println!("{edge}x{edge}, one thread; errors relative to the reference's mean");
     println!(
         "{:20} {:28} {:>8} {:>8} {:>7} {:>7} {:>7}",
         "scene", "settings", "seconds", "records", "RMSE", "bias", "worst"
@@ -25,7 +32,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let (scene, depth) = name.split_once('.').ok_or("expected SCENE.DEPTH, for instance cornell.full")?;
         let truth = reference(name);
         let (scene, camera) = load(&format!("{scene}.glb"));
-        let base = settings(camera, depth);
+        let base = Settings { width: edge, height: edge, ..settings(camera, depth) };
         let cached = |rays, spp, a| Settings { rays, spp, a, ..base.clone() };
         let path = |spp| Settings { method: Method::Path, spp, ..base.clone() };
         let ladder = [cached(512, 16, 0.4), base.clone(), cached(8192, 128, 0.2), path(16), path(64), path(256)];
@@ -45,7 +52,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let records: usize = levels.iter().map(|l| l.len()).sum();
             let image: Vec<_> =
                 pixels.chunks_exact(CHANNELS).map(|p| [p[0].into(), p[1].into(), p[2].into()]).collect();
-            let v = judge(&image, &truth);
+            let v = judge(&reduce(&image), &truth);
             println!(
                 "{name:20} {label:28} {seconds:8.2} {records:8} {:6.2}% {:+6.2}% {:6.2}%",
                 100.0 * v.rmse,
