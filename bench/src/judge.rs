@@ -50,7 +50,7 @@ pub fn render(scene: Scene, settings: Settings) -> Vec<[f64; 3]> {
 /// Unless its edge is a multiple of [`SIZE`].
 pub fn reduce(image: &[[f64; 3]]) -> Vec<[f64; 3]> {
     let edge = image.len().isqrt();
-    assert!(edge * edge == image.len() && edge % SIZE == 0, "a square picture of a multiple of {SIZE} pixels");
+    assert!(edge * edge == image.len() && edge.is_multiple_of(SIZE), "a square picture of a multiple of {SIZE} pixels");
     let factor = edge / SIZE;
     let mut small = vec![[0.0; 3]; SIZE * SIZE];
     for (i, pixel) in image.iter().enumerate() {

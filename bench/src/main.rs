@@ -16,7 +16,7 @@ const SCENES: [&str; 5] = ["cornell.full", "stairs.full", "leak.full", "sphere-p
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut asked: Vec<String> = std::env::args().skip(1).collect();
     let edge = match asked.first().and_then(|first| first.parse::<u32>().ok()) {
-        Some(edge) if edge > 0 && edge as usize % SIZE == 0 => edge,
+        Some(edge) if edge > 0 && (edge as usize).is_multiple_of(SIZE) => edge,
         Some(edge) => return Err(format!("{edge}: expected a multiple of {SIZE}").into()),
         None => SIZE as u32,
     };

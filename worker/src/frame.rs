@@ -23,7 +23,7 @@ pub const CHANNELS: usize = 13;
 const LEVELS_MAX: u32 = 3;
 
 /// Reach a record has at least, as a fraction of the picture's height projected at its site: level 1, deeper levels. A
-/// larger picture shows the same light with more pixels, it does not need more records.
+/// larger picture shows the same light with more pixels, it needs few more records.
 const REACH_MIN_HEIGHT: [f32; 2] = [1.0 / 128.0, 1.0 / 40.0];
 
 /// The same in pixels, for small pictures (course slides: 1.5 to 3).
