@@ -46,20 +46,13 @@ pub fn run(
                 counts
             }
         };
-        done.add(&counts);
+        done.counts.add(&counts);
     }
     done.cpu_seconds = clock.seconds();
     Some(done)
 }
 
 impl Done {
-    fn add(&mut self, counts: &Counts) {
-        self.counts.path_rays += counts.path_rays;
-        self.counts.shadow_rays += counts.shadow_rays;
-        self.counts.queries += counts.queries;
-        self.counts.misses += counts.misses;
-    }
-
     /// The counts of `Complete`: `cpu_seconds.PHASE`, `records.PHASE`, `rays.path.PHASE`, `rays.shadow.PHASE` (PHASE is
     /// `level N` or `pixels`), `queries`, `misses`, and of bytes on the wire `bytes.inserted` and `bytes.subscribed`
     /// (packed records), `bytes.tiles` (packed pixels).
