@@ -119,11 +119,6 @@ impl<C: Cached> Sealed<C> {
     pub fn digest(&self) -> Digest {
         self.digest
     }
-
-    /// Each record with the R it counts with, in no particular order.
-    pub fn iter(&self) -> impl Iterator<Item = (&C, f32)> {
-        self.records.iter().zip(self.derived.iter().map(|d| d.radius))
-    }
 }
 
 #[cfg(test)]

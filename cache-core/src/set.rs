@@ -82,11 +82,6 @@ impl<C: Cached> RecordSet<C> {
         &self.log[position.min(self.log.len())..]
     }
 
-    /// The record with an id, and its level.
-    pub fn get(&self, id: RecordId) -> Option<(u32, &C)> {
-        self.index.get(&id).map(|&at| (self.log[at].0, &self.log[at].1))
-    }
-
     /// The records of one level, in order of arrival, replaced ones left out.
     pub fn level(&self, level: u32) -> impl Iterator<Item = &C> {
         self.log
@@ -186,7 +181,7 @@ mod tests {
         // Little endian: 2.0 begins 00 00 00, 1.0 begins 00 00 80.
         assert_eq!(set.insert(1, at(2.0)), Inserted::Replaced);
         assert_eq!(set.insert(1, at(1.0)), Inserted::Known);
-        assert_eq!(set.get(RecordId(1)).map(|(_, r)| r.position.x), Some(2.0));
+        assert_eq!(set.level(1).next().map(|r| r.position.x), Some(2.0));
         assert_eq!((set.len(), set.position(), set.conflicts()), (1, 2, 2));
     }
 }

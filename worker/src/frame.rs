@@ -127,7 +127,7 @@ impl Frame {
     }
 
     /// Tests one pixel's candidate and gathers its record where the sealed cache covers none.
-    pub fn candidate(
+    fn candidate(
         &self,
         level: u32,
         pass: u32,
