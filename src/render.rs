@@ -237,7 +237,8 @@ impl Render<'_> {
         frames: &Frames,
     ) -> Result<Result<Streaming<v1::FrameEvent>, End>, Failure> {
         let opening = client::retry(|| {
-            let request = v1::OpenRequest { spec: Some(job.spec.clone()), version: VERSION.into() };
+            let request =
+                v1::OpenRequest { spec: Some(job.spec.clone()), version: VERSION.into(), base: Default::default() };
             let mut frames = frames.clone();
             async move { frames.open(request).await }
         });

@@ -24,6 +24,16 @@ impl Digest {
     pub fn add(&mut self, id: RecordId) {
         self.0 = self.0.wrapping_add(id.0);
     }
+
+    /// Takes one record out again.
+    pub fn remove(&mut self, id: RecordId) {
+        self.0 = self.0.wrapping_sub(id.0);
+    }
+
+    /// The digest of two sets that have no record in common.
+    pub fn and(self, other: Self) -> Self {
+        Self(self.0.wrapping_add(other.0))
+    }
 }
 
 /// Everything a record is determined by.

@@ -36,4 +36,4 @@ pub use id::{Namespace, RecordId};
 pub use irradiance::Irradiance;
 pub use math::Rgb;
 pub use sealed::Sealed;
-pub use set::RecordSet;
+pub use set::{RecordSet, Tag};

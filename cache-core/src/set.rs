@@ -1,10 +1,52 @@
 //! Id to record: the grow-only set every replica holds. Union is the only merge: idempotent, commutative, associative.
 
-use std::collections::HashMap;
 use std::collections::hash_map::Entry;
+use std::collections::{BTreeMap, HashMap};
 
 use crate::cached::Cached;
 use crate::id::{Digest, RecordId};
+
+/// What a set knows of a record besides its content.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
+pub struct Tag {
+    /// Bounce the record answers for, from 1.
+    pub level: u32,
+    /// In the draft of a frame: the step that gathered it; later steps read it. Elsewhere 0.
+    pub step: u32,
+}
+
+impl Tag {
+    /// A record of `level` that no frame's step gathered.
+    pub fn level(level: u32) -> Self {
+        Self { level, step: 0 }
+    }
+}
+
+/// How many records, and which.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub struct Sum {
+    /// How many.
+    pub records: u64,
+    /// Order-free digest of their ids.
+    pub digest: Digest,
+}
+
+impl Sum {
+    fn add(&mut self, id: RecordId) {
+        self.records += 1;
+        self.digest.add(id);
+    }
+
+    fn remove(&mut self, id: RecordId) {
+        self.records -= 1;
+        self.digest.remove(id);
+    }
+
+    /// Both together; they must have no record in common.
+    pub fn and(self, other: Self) -> Self {
+        Self { records: self.records + other.records, digest: self.digest.and(other.digest) }
+    }
+}
 
 /// What became of an inserted record.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -24,37 +66,43 @@ pub enum Inserted {
 /// - Equal ids with different bytes come from different builds or machines; the smaller bytes win everywhere.
 #[derive(Clone, Debug)]
 pub struct RecordSet<C> {
-    log: Vec<(u32, C)>,
+    log: Vec<(Tag, C)>,
     index: HashMap<RecordId, usize>,
-    digest: Digest,
+    /// What each step gathered.
+    steps: BTreeMap<u32, Sum>,
     conflicts: u64,
 }
 
 impl<C> Default for RecordSet<C> {
     fn default() -> Self {
-        Self { log: Vec::new(), index: HashMap::new(), digest: Digest::default(), conflicts: 0 }
+        Self { log: Vec::new(), index: HashMap::new(), steps: BTreeMap::new(), conflicts: 0 }
     }
 }
 
 impl<C: Cached> RecordSet<C> {
-    /// Unites with one record of `level`.
-    pub fn insert(&mut self, level: u32, record: C) -> Inserted {
-        let position = self.log.len();
-        match self.index.entry(record.id()) {
+    /// Unites with one record.
+    pub fn insert(&mut self, tag: Tag, record: C) -> Inserted {
+        let (id, position) = (record.id(), self.log.len());
+        match self.index.entry(id) {
             Entry::Vacant(slot) => {
                 slot.insert(position);
-                self.digest.add(record.id());
-                self.log.push((level, record));
+                self.steps.entry(tag.step).or_default().add(id);
+                self.log.push((tag, record));
                 Inserted::Added
             }
             Entry::Occupied(mut slot) => {
-                let order = bytes(level, &record).cmp(&bytes_at(&self.log, *slot.get()));
+                let (known, held) = &self.log[*slot.get()];
+                let order = (tag, bytes(&record)).cmp(&(*known, bytes(held)));
                 if order.is_ne() {
                     self.conflicts += 1;
                 }
                 if order.is_lt() {
+                    if let Some(sum) = self.steps.get_mut(&known.step) {
+                        sum.remove(id);
+                    }
+                    self.steps.entry(tag.step).or_default().add(id);
                     slot.insert(position);
-                    self.log.push((level, record));
+                    self.log.push((tag, record));
                     return Inserted::Replaced;
                 }
                 Inserted::Known
@@ -77,8 +125,13 @@ impl<C: Cached> RecordSet<C> {
         self.log.len()
     }
 
-    /// The log from a position on: (level, record) in order of arrival. Empty past the end.
-    pub fn since(&self, position: usize) -> &[(u32, C)] {
+    /// The record of an id.
+    pub fn get(&self, id: RecordId) -> Option<&(Tag, C)> {
+        self.index.get(&id).map(|&at| &self.log[at])
+    }
+
+    /// The log from a position on, in order of arrival. Empty past the end.
+    pub fn since(&self, position: usize) -> &[(Tag, C)] {
         &self.log[position.min(self.log.len())..]
     }
 
@@ -87,13 +140,23 @@ impl<C: Cached> RecordSet<C> {
         self.log
             .iter()
             .enumerate()
-            .filter(move |(at, (l, r))| *l == level && self.index.get(&r.id()) == Some(at))
+            .filter(move |(at, (tag, r))| tag.level == level && self.index.get(&r.id()) == Some(at))
             .map(|(_, (_, r))| r)
+    }
+
+    /// All records.
+    pub fn sum(&self) -> Sum {
+        self.steps.values().copied().fold(Sum::default(), Sum::and)
+    }
+
+    /// The records of steps before `step`.
+    pub fn before(&self, step: u32) -> Sum {
+        self.steps.range(..step).map(|(_, sum)| *sum).fold(Sum::default(), Sum::and)
     }
 
     /// Order-free digest of the ids.
     pub fn digest(&self) -> Digest {
-        self.digest
+        self.sum().digest
     }
 
     /// How often an id came with other bytes than before.
@@ -102,14 +165,10 @@ impl<C: Cached> RecordSet<C> {
     }
 }
 
-fn bytes<C: Cached>(level: u32, record: &C) -> Vec<u8> {
-    let mut bytes = level.to_le_bytes().to_vec();
+fn bytes<C: Cached>(record: &C) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(C::BYTES);
     record.encode(&mut bytes);
     bytes
-}
-
-fn bytes_at<C: Cached>(log: &[(u32, C)], at: usize) -> Vec<u8> {
-    bytes(log[at].0, &log[at].1)
 }
 
 #[cfg(test)]
@@ -119,6 +178,8 @@ mod tests {
 
     use super::*;
     use crate::null::Null;
+
+    const ONE: Tag = Tag { level: 1, step: 0 };
 
     /// Few ids and few contents, so that repeats and conflicts are common.
     fn records() -> impl Strategy<Value = Vec<Null>> {
@@ -133,14 +194,14 @@ mod tests {
     fn union(parts: &[&[Null]]) -> RecordSet<Null> {
         let mut set = RecordSet::default();
         for record in parts.iter().copied().flatten() {
-            set.insert(1, *record);
+            set.insert(ONE, *record);
         }
         set
     }
 
     /// What a set holds, whatever way it came there.
     fn content(set: &RecordSet<Null>) -> (Digest, Vec<(u128, Vec<u8>)>) {
-        let mut all: Vec<_> = set.level(1).map(|r| (r.id.0, bytes(1, r))).collect();
+        let mut all: Vec<_> = set.level(1).map(|r| (r.id.0, bytes(r))).collect();
         all.sort();
         (set.digest(), all)
     }
@@ -167,8 +228,8 @@ mod tests {
         fn a_log_replayed_from_any_position_catches_up(a in records(), b in records()) {
             let mut far = union(&[&a]);
             let near = union(&[&a, &b]);
-            for (level, record) in near.since(far.position()) {
-                far.insert(*level, *record);
+            for (tag, record) in near.since(far.position()) {
+                far.insert(*tag, *record);
             }
             prop_assert_eq!(content(&far), content(&near));
         }
@@ -179,9 +240,28 @@ mod tests {
         let at = |x: f32| Null { id: RecordId(1), position: Vec3::splat(x), radius: 1.0 };
         let mut set = union(&[&[at(1.0)]]);
         // Little endian: 2.0 begins 00 00 00, 1.0 begins 00 00 80.
-        assert_eq!(set.insert(1, at(2.0)), Inserted::Replaced);
-        assert_eq!(set.insert(1, at(1.0)), Inserted::Known);
+        assert_eq!(set.insert(ONE, at(2.0)), Inserted::Replaced);
+        assert_eq!(set.insert(ONE, at(1.0)), Inserted::Known);
         assert_eq!(set.level(1).next().map(|r| r.position.x), Some(2.0));
         assert_eq!((set.len(), set.position(), set.conflicts()), (1, 2, 2));
+    }
+
+    #[test]
+    fn what_a_step_may_read_does_not_depend_on_arrival() {
+        let null = |id| Null { id: RecordId(id), position: Vec3::ZERO, radius: 1.0 };
+        let at = |step| Tag { level: 1, step };
+        let mut entries = [(at(2), null(4)), (at(0), null(1)), (at(1), null(2)), (at(1), null(9))];
+        for _ in 0..4 {
+            entries.rotate_left(1);
+            let mut set = RecordSet::default();
+            for (tag, record) in entries {
+                set.insert(tag, record);
+            }
+            let sums: Vec<_> = (0..4).map(|step| (set.before(step).records, set.before(step).digest.0)).collect();
+            assert_eq!(sums, [(0, 0), (1, 1), (3, 12), (4, 16)]);
+            // The same record from a lower step: it takes the place, and counts there.
+            assert_eq!(set.insert(at(0), null(4)), Inserted::Replaced);
+            assert_eq!((set.before(1).digest.0, set.before(3).digest.0, set.sum().records), (5, 16, 4));
+        }
     }
 }

@@ -53,7 +53,7 @@ impl Cache for CacheService {
     type SubscribeStream = Subscription;
 
     async fn subscribe(&self, request: Request<v1::SubscribeRequest>) -> Result<Response<Subscription>, Status> {
-        let v1::SubscribeRequest { namespace, position } = request.into_inner();
+        let v1::SubscribeRequest { namespace, position, digest: _ } = request.into_inner();
         let namespace = convert::namespace(&namespace).map_err(Refusal::from)?;
         let subscription = Subscription::new(&self.store, namespace, position);
         // Told before the stream begins, so that the client learns it from the call itself.
@@ -102,7 +102,7 @@ impl Subscription {
         let Some((count, batch)) = store.replica().read(&self.namespace, self.position)? else { return Ok(None) };
         let position = self.position;
         self.position += count;
-        Ok(Some(v1::SubscribeResponse { batch: Some(batch), position }))
+        Ok(Some(v1::SubscribeResponse { batch: Some(batch), position, end: 0 }))
     }
 }
 

@@ -212,7 +212,7 @@ impl Frame {
     fn event(&mut self, workers: u32, mark: impl FnOnce() -> Mark) -> Option<Event> {
         let outbox = &mut self.outbox;
         if std::mem::take(&mut outbox.opening) {
-            return Some(Event::Opened(v1::FrameOpened { frame: self.id }));
+            return Some(Event::Opened(v1::FrameOpened { frame: self.id, ..Default::default() }));
         }
         if let Some(declined) = outbox.declined.pop_front() {
             return Some(Event::Declined(declined));

@@ -114,7 +114,7 @@ impl FramesTrait for FramesService {
     type OpenStream = Owner;
 
     async fn open(&self, request: Request<v1::OpenRequest>) -> Result<Response<Owner>, Status> {
-        let v1::OpenRequest { spec, version } = request.into_inner();
+        let v1::OpenRequest { spec, version, base: _ } = request.into_inner();
         same_version(&version)?;
         let spec = spec.ok_or(Refusal::Malformed(Malformed::Missing("spec")))?;
         let frame = self.0.change(|frames, _| frames.open(spec, |namespace| self.0.mark(namespace)))?;
@@ -122,9 +122,9 @@ impl FramesTrait for FramesService {
         Ok(Response::new(Owner::new(self.0.clone(), frame)))
     }
 
-    async fn describe(&self, request: Request<v1::DescribeRequest>) -> Result<Response<v1::FrameSpec>, Status> {
+    async fn describe(&self, request: Request<v1::DescribeRequest>) -> Result<Response<v1::DescribeResponse>, Status> {
         let spec = lock(&self.0.frames).describe(request.get_ref().frame)?.clone();
-        Ok(Response::new(spec))
+        Ok(Response::new(v1::DescribeResponse { spec: Some(spec), ..Default::default() }))
     }
 
     async fn lease(&self, request: Request<v1::LeaseRequest>) -> Result<Response<v1::LeaseResponse>, Status> {

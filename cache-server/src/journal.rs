@@ -1,23 +1,26 @@
-//! The door to durable storage. What goes through it is the wire's own batch, so that a journal needs to know nothing
+//! The door to durable storage. What goes through it are the wire's own entries, so that a journal needs to know nothing
 //! about records, and what comes back is checked like anything else from outside.
 
 use std::io;
 
-use cache_proto::v1::RecordBatch;
+use cache_proto::v1::Entry;
 
-/// Keeps batches of records, in order.
+/// Keeps entries, in order. Entries merge by union: repeats and order do no harm.
 pub trait Journal: Send {
-    /// Keeps a sound batch. The insert is acknowledged, and its records shown to others, only after this returned.
+    /// Keeps sound entries. They are acknowledged, and shown to others, only after this returned.
     ///
     /// # Errors
-    /// When the batch is not safely kept; nothing of it is used then.
-    fn append(&mut self, batch: &RecordBatch) -> io::Result<()>;
+    /// When they are not safely kept; the caller takes none of them for kept then.
+    fn append(&mut self, entries: &[Entry]) -> io::Result<()>;
 
-    /// Calls `each` with every batch kept, in the order they were appended.
+    /// Calls `each` with every entry kept, in the order they were appended.
     ///
     /// # Errors
     /// When the journal cannot be read, or the first error of `each`.
-    fn replay(&mut self, each: &mut dyn FnMut(RecordBatch) -> io::Result<()>) -> io::Result<()>;
+    fn replay(&mut self, each: &mut dyn FnMut(Entry) -> io::Result<()>) -> io::Result<()>;
+
+    /// Whether `append` waits for a device, and must be kept off the async threads.
+    fn waits(&self) -> bool;
 }
 
 /// The journal that keeps nothing: records live as long as the server's memory.
@@ -25,11 +28,15 @@ pub trait Journal: Send {
 pub struct Nowhere;
 
 impl Journal for Nowhere {
-    fn append(&mut self, _: &RecordBatch) -> io::Result<()> {
+    fn append(&mut self, _: &[Entry]) -> io::Result<()> {
         Ok(())
     }
 
-    fn replay(&mut self, _: &mut dyn FnMut(RecordBatch) -> io::Result<()>) -> io::Result<()> {
+    fn replay(&mut self, _: &mut dyn FnMut(Entry) -> io::Result<()>) -> io::Result<()> {
         Ok(())
+    }
+
+    fn waits(&self) -> bool {
+        false
     }
 }

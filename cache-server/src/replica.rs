@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use cache_core::id::Digest;
-use cache_core::{Irradiance, Namespace, RecordSet, set};
+use cache_core::{Irradiance, Namespace, RecordSet, Tag, set};
 use cache_proto::convert::{self, BATCH_RECORDS_MAX};
 use cache_proto::v1;
 
@@ -77,7 +77,7 @@ impl Replica {
     ///
     /// # Errors
     /// [`Refusal::Full`]; nothing of the batch is used then.
-    pub fn insert(&mut self, namespace: Namespace, level: u32, records: &[Irradiance]) -> Result<Added, Refusal> {
+    pub fn insert(&mut self, namespace: Namespace, tag: Tag, records: &[Irradiance]) -> Result<Added, Refusal> {
         if records.is_empty() {
             return Ok(Added { added: 0, position: self.mark(&namespace).position });
         }
@@ -85,7 +85,7 @@ impl Replica {
         let set = self.sets.entry(namespace).or_default();
         let (before, known) = (set.position(), set.len());
         for record in records {
-            let outcome = set.insert(level, *record);
+            let outcome = set.insert(tag, *record);
             if outcome == set::Inserted::Replaced {
                 tracing::warn!(id = format_args!("{:032x}", record.id.0), "a record came twice with different content");
             }
@@ -94,24 +94,24 @@ impl Replica {
         Ok(Added { added: (set.len() - known) as u64, position: set.position() as u64 })
     }
 
-    /// What stands at a position of the log: records of one level, as many as fit one batch, and how many those are.
+    /// What stands at a position of the log: records of one tag, as many as fit one batch, and how many those are.
     /// `None` at the end.
     ///
     /// # Errors
     /// [`Refusal::PastEnd`].
     pub fn read(&self, namespace: &Namespace, position: u64) -> Result<Option<(u64, v1::RecordBatch)>, Refusal> {
         let rest = self.since(namespace, position)?;
-        let Some(&(level, _)) = rest.first() else { return Ok(None) };
-        let count = rest.iter().take(BATCH_RECORDS_MAX).take_while(|(l, _)| *l == level).count();
+        let Some(&(tag, _)) = rest.first() else { return Ok(None) };
+        let count = rest.iter().take(BATCH_RECORDS_MAX).take_while(|(t, _)| *t == tag).count();
         let run = rest[..count].iter().map(|(_, record)| record);
-        Ok(Some((count as u64, convert::pack(namespace, level, run))))
+        Ok(Some((count as u64, convert::pack(namespace, tag, run))))
     }
 
-    /// The log of a namespace from a position on: (level, record) in order of arrival.
+    /// The log of a namespace from a position on: in order of arrival.
     ///
     /// # Errors
     /// [`Refusal::PastEnd`].
-    pub fn since(&self, namespace: &Namespace, position: u64) -> Result<&[(u32, Irradiance)], Refusal> {
+    pub fn since(&self, namespace: &Namespace, position: u64) -> Result<&[(Tag, Irradiance)], Refusal> {
         let set = self.sets.get(namespace);
         let end = set.map_or(0, RecordSet::position) as u64;
         if position > end {
@@ -143,6 +143,7 @@ impl Replica {
             records: set.len() as u64,
             digest: convert::digest_bytes(set.digest()),
             conflicts: set.conflicts(),
+            label: None,
         };
         all.into_iter().map(info).collect()
     }
@@ -175,9 +176,9 @@ mod tests {
     /// Reads batches from a position to the end into another replica.
     fn follow(from: &Replica, position: &mut u64, to: &mut Replica) {
         while let Some((count, batch)) = from.read(&NAMESPACE, *position).expect("not past the end") {
-            let (namespace, level, records) = convert::unpack(&batch).expect("sound");
+            let (namespace, tag, records) = convert::unpack(&batch).expect("sound");
             assert_eq!(records.len() as u64, count);
-            to.insert(namespace, level, &records).expect("room");
+            to.insert(namespace, tag, &records).expect("room");
             *position += count;
         }
     }
@@ -192,7 +193,7 @@ mod tests {
             for (at, (level, records)) in batches.iter().enumerate() {
                 let records: Vec<_> = records.iter().map(|&(id, x)| record(id, x.into())).collect();
                 let before = near.mark(&NAMESPACE);
-                let added = near.insert(NAMESPACE, *level, &records).expect("room");
+                let added = near.insert(NAMESPACE, Tag::level(*level), &records).expect("room");
                 let after = near.mark(&NAMESPACE);
                 prop_assert_eq!((added.added, added.position), (after.records - before.records, after.position));
                 if at % 3 == 0 {
@@ -212,8 +213,8 @@ mod tests {
     fn batches_hold_one_level_and_at_most_4096_records() {
         let mut replica = Replica::new(Limits::default());
         let records: Vec<_> = (0..5000).map(|id| record(id, 0.0)).collect();
-        replica.insert(NAMESPACE, 1, &records).expect("room");
-        replica.insert(NAMESPACE, 2, &[record(5000, 0.0)]).expect("room");
+        replica.insert(NAMESPACE, Tag::level(1), &records).expect("room");
+        replica.insert(NAMESPACE, Tag::level(2), &[record(5000, 0.0)]).expect("room");
         let count = |position| replica.read(&NAMESPACE, position).map(|read| read.map(|(count, b)| (count, b.level)));
         assert_eq!(count(0).expect("there"), Some((4096, 1)));
         assert_eq!(count(4096).expect("there"), Some((904, 1)));
@@ -226,12 +227,12 @@ mod tests {
     #[test]
     fn past_the_limits_nothing_of_a_batch_is_used() {
         let mut replica = Replica::new(Limits { namespaces: 1, records: 3 });
-        replica.insert(NAMESPACE, 1, &[record(1, 0.0), record(2, 0.0)]).expect("room");
-        let full = replica.insert(NAMESPACE, 1, &[record(3, 0.0), record(4, 0.0)]);
+        replica.insert(NAMESPACE, Tag::level(1), &[record(1, 0.0), record(2, 0.0)]).expect("room");
+        let full = replica.insert(NAMESPACE, Tag::level(1), &[record(3, 0.0), record(4, 0.0)]);
         assert!(full.expect_err("full").to_string().contains("at most 3"));
         assert_eq!(replica.mark(&NAMESPACE).records, 2);
-        let full = replica.insert(Namespace([8; 32]), 1, &[record(3, 0.0)]);
+        let full = replica.insert(Namespace([8; 32]), Tag::level(1), &[record(3, 0.0)]);
         assert!(full.expect_err("full").to_string().contains("namespaces"));
-        assert_eq!(replica.insert(Namespace([9; 32]), 1, &[]).expect("nothing"), Added::default());
+        assert_eq!(replica.insert(Namespace([9; 32]), Tag::level(1), &[]).expect("nothing"), Added::default());
     }
 }

@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
 
 use cache_core::{Irradiance, Namespace};
+use cache_proto::v1::entry::Entry as Kind;
 use cache_proto::{convert, v1};
 
 use crate::bell::Bell;
@@ -30,9 +31,10 @@ impl Store {
     /// When the journal cannot be read, holds an unsound batch, or more than the limits allow.
     pub fn open(limits: Limits, mut journal: Box<dyn Journal>) -> io::Result<Self> {
         let mut replica = Replica::new(limits);
-        journal.replay(&mut |batch| {
-            let (namespace, level, records) = convert::unpack(&batch).map_err(io::Error::other)?;
-            replica.insert(namespace, level, &records).map(drop).map_err(io::Error::other)
+        journal.replay(&mut |entry| {
+            let Some(Kind::Batch(batch)) = entry.entry else { return Ok(()) };
+            let (namespace, tag, records) = convert::unpack(&batch).map_err(io::Error::other)?;
+            replica.insert(namespace, tag, &records).map(drop).map_err(io::Error::other)
         })?;
         Ok(Self {
             journal: Mutex::new(journal),
@@ -47,15 +49,15 @@ impl Store {
     /// # Errors
     /// What is unsound about the batch, [`Refusal::Full`] or [`Refusal::Journal`]; nothing of it is used then.
     pub fn insert(&self, batch: &v1::RecordBatch) -> Result<Added, Refusal> {
-        let (namespace, level, records) = convert::unpack::<Irradiance>(batch)?;
+        let (namespace, tag, records) = convert::unpack::<Irradiance>(batch)?;
         // The journal's lock spans both steps: the journal has the order of the log, and the limit checked is the
         // limit met.
         let mut journal = lock(&self.journal);
         self.replica().admit(&namespace, records.len())?;
-        journal.append(batch)?;
+        journal.append(&[v1::Entry { entry: Some(Kind::Batch(batch.clone())) }])?;
         let added = {
             let mut replica = self.replica.write().unwrap_or_else(PoisonError::into_inner);
-            replica.insert(namespace, level, &records)?
+            replica.insert(namespace, tag, &records)?
         };
         drop(journal);
         self.grown.ring();

@@ -3,7 +3,7 @@
 use std::convert::Infallible;
 use std::time::Duration;
 
-use cache_core::{Irradiance, Namespace, Query, RecordId, Sealed};
+use cache_core::{Irradiance, Namespace, Query, RecordId, Sealed, Tag};
 use cache_proto::v1::cache_client::CacheClient;
 use cache_proto::v1::frame_event::Event;
 use cache_proto::v1::frames_client::FramesClient;
@@ -103,11 +103,11 @@ async fn insert(cache: &mut CacheClient<Channel>, batches: Vec<v1::RecordBatch>)
 }
 
 fn subscribe(position: u64) -> v1::SubscribeRequest {
-    v1::SubscribeRequest { namespace: NAMESPACE.0.to_vec().into(), position }
+    v1::SubscribeRequest { namespace: NAMESPACE.0.to_vec().into(), position, digest: Default::default() }
 }
 
 /// Reads a subscription until `count` records have come; returns them with their levels.
-async fn read(stream: &mut tonic::Streaming<v1::SubscribeResponse>, from: u64, count: usize) -> Vec<(u32, Irradiance)> {
+async fn read(stream: &mut tonic::Streaming<v1::SubscribeResponse>, from: u64, count: usize) -> Vec<(Tag, Irradiance)> {
     let mut all = Vec::new();
     while all.len() < count {
         let response = soon(stream.message()).await.expect("no error").expect("no end");
@@ -126,8 +126,10 @@ async fn what_is_inserted_is_streamed_counted_and_digested() {
         let mut cache = server.cache();
         // A namespace that is not there yet: the subscriber waits.
         let mut early = soon(cache.subscribe(subscribe(0))).await.expect("accepted").into_inner();
-        let batches =
-            vec![convert::pack(&NAMESPACE, 1, &records(0..4096)), convert::pack(&NAMESPACE, 2, &records(4096..5000))];
+        let batches = vec![
+            convert::pack(&NAMESPACE, Tag::level(1), &records(0..4096)),
+            convert::pack(&NAMESPACE, Tag::level(2), &records(4096..5000)),
+        ];
         let added = insert(&mut cache, batches.clone()).await.expect("sound");
         assert_eq!((added.added, added.position), (5000, 5000));
         let again = insert(&mut cache, batches).await.expect("harmless");
@@ -158,15 +160,15 @@ async fn what_is_inserted_is_streamed_counted_and_digested() {
 async fn a_bad_batch_is_refused_by_name_and_the_connection_stays_usable() {
     let server = Server::unix().await;
     let mut cache = server.cache();
-    let good = convert::pack(&NAMESPACE, 1, &records(0..10));
+    let good = convert::pack(&NAMESPACE, Tag::level(1), &records(0..10));
     let mut bad = record(11);
     bad.irradiance.y = f32::NAN;
     let spoilt = [
-        ("record 1 of the batch: irradiance", convert::pack(&NAMESPACE, 1, &[record(10), bad])),
+        ("record 1 of the batch: irradiance", convert::pack(&NAMESPACE, Tag::level(1), &[record(10), bad])),
         ("namespace has 3 bytes", v1::RecordBatch { namespace: vec![0; 3].into(), ..good.clone() }),
         ("kind 9", v1::RecordBatch { kind: 9, ..good.clone() }),
         ("level is 0", v1::RecordBatch { level: 0, ..good.clone() }),
-        ("at most 4096", convert::pack(&NAMESPACE, 1, &records(0..4097))),
+        ("at most 4096", convert::pack(&NAMESPACE, Tag::level(1), &records(0..4097))),
         ("expected 112", v1::RecordBatch { records: good.records.slice(1..113 + 5), ..good.clone() }),
     ];
     for (named, batch) in spoilt {
@@ -189,7 +191,7 @@ async fn a_subscriber_that_does_not_read_holds_nobody_back() {
     let deaf = soon(cache.subscribe(subscribe(0))).await.expect("accepted").into_inner();
     let mut keen = soon(cache.subscribe(subscribe(0))).await.expect("accepted").into_inner();
     for at in 0..40 {
-        let batch = convert::pack(&NAMESPACE, 1, &records(at * 4096..(at + 1) * 4096));
+        let batch = convert::pack(&NAMESPACE, Tag::level(1), &records(at * 4096..(at + 1) * 4096));
         insert(&mut cache, vec![batch]).await.expect("sound");
         assert_eq!(read(&mut keen, u64::from(at) * 4096, 4096).await.len(), 4096);
     }
@@ -213,7 +215,7 @@ async fn query_answers_what_a_replica_would_bit_for_bit() {
     for (from, to) in [(0, 150), (150, 300)] {
         let mut added = records(from..to);
         added.reverse();
-        insert(&mut cache, vec![convert::pack(&NAMESPACE, 2, &added)]).await.expect("sound");
+        insert(&mut cache, vec![convert::pack(&NAMESPACE, Tag::level(2), &added)]).await.expect("sound");
         let mut local = Sealed::new(0.3);
         local.extend(records(0..to));
         let expected: Vec<u8> = queries
@@ -288,7 +290,7 @@ fn spec() -> v1::FrameSpec {
 }
 
 fn open(version: &str) -> v1::OpenRequest {
-    v1::OpenRequest { spec: Some(spec()), version: version.into() }
+    v1::OpenRequest { spec: Some(spec()), version: version.into(), base: Default::default() }
 }
 
 fn ask(worker: &str) -> v1::LeaseRequest {
@@ -304,7 +306,7 @@ async fn work(server: &Server, name: &str) -> Infallible {
         let step = lease.step.expect("a step");
         let tiles = lease.tile_from..lease.tile_to;
         let gathered = if step.index == 0 { records(tiles.clone()) } else { vec![] };
-        insert(&mut cache, vec![convert::pack(&NAMESPACE, 1, &gathered)]).await.expect("sound");
+        insert(&mut cache, vec![convert::pack(&NAMESPACE, Tag::level(1), &gathered)]).await.expect("sound");
         // The last of the three tiles is half as wide.
         let pixels = |tile| v1::FrameTile { tile, pixels: vec![1; if tile == 2 { 8 } else { 16 } * 16 * 52].into() };
         let request = v1::CompleteRequest {
@@ -367,7 +369,7 @@ async fn an_owner_that_goes_away_cancels_its_frame() {
     };
     let lease = waiting.expect("served").into_inner().lease.expect("work");
     let described = soon(frames.describe(v1::DescribeRequest { frame: lease.frame })).await.expect("open");
-    assert_eq!(described.into_inner(), spec());
+    assert_eq!(described.into_inner().spec, Some(spec()));
     let renewed = soon(frames.renew(v1::RenewRequest { worker: "w".into() })).await.expect("renewed");
     assert_eq!(renewed.into_inner().leases, [lease.id]);
 

@@ -1,6 +1,7 @@
 //! The only place where bytes from the wire become records, and core's steps become messages.
 
 use cache_core::id::Digest;
+use cache_core::set::Tag;
 use cache_core::{Cached, Invalid, Namespace, rounds};
 
 use crate::v1;
@@ -72,10 +73,10 @@ pub fn digest_bytes(digest: Digest) -> prost::bytes::Bytes {
     prost::bytes::Bytes::copy_from_slice(&digest.0.to_le_bytes())
 }
 
-/// Packs records of one level. At most [`BATCH_RECORDS_MAX`] of them make a batch a server accepts.
+/// Packs records of one tag. At most [`BATCH_RECORDS_MAX`] of them make a batch a server accepts.
 pub fn pack<'a, C: Cached>(
     namespace: &Namespace,
-    level: u32,
+    tag: Tag,
     records: impl IntoIterator<Item = &'a C>,
 ) -> v1::RecordBatch {
     let records = records.into_iter();
@@ -86,16 +87,17 @@ pub fn pack<'a, C: Cached>(
     v1::RecordBatch {
         namespace: prost::bytes::Bytes::copy_from_slice(&namespace.0),
         kind: C::KIND,
-        level,
+        level: tag.level,
         records: bytes.into(),
+        step: tag.step,
     }
 }
 
-/// Reads and checks a batch: its namespace, level and records.
+/// Reads and checks a batch: its namespace, tag and records.
 ///
 /// # Errors
 /// The first thing that is not sound. Nothing of an unsound batch is used.
-pub fn unpack<C: Cached>(batch: &v1::RecordBatch) -> Result<(Namespace, u32, Vec<C>), Malformed> {
+pub fn unpack<C: Cached>(batch: &v1::RecordBatch) -> Result<(Namespace, Tag, Vec<C>), Malformed> {
     let namespace = namespace(&batch.namespace)?;
     if batch.kind != C::KIND {
         return Err(Malformed::Kind { got: batch.kind, expected: C::KIND });
@@ -108,7 +110,7 @@ pub fn unpack<C: Cached>(batch: &v1::RecordBatch) -> Result<(Namespace, u32, Vec
     }
     let record = |(index, bytes)| C::decode(bytes).map_err(|reason| Malformed::Record { index, reason });
     let records = batch.records.chunks(C::BYTES).enumerate().map(record).collect::<Result<_, _>>()?;
-    Ok((namespace, batch.level, records))
+    Ok((namespace, Tag { level: batch.level, step: batch.step }, records))
 }
 
 /// What a step of the plan looks like on the wire, sealed at a position of the namespace's log.
@@ -146,7 +148,7 @@ mod tests {
     proptest! {
         #[test]
         fn random_bytes_never_panic_and_never_pass_unsound(bytes in prop::collection::vec(any::<u8>(), 0..600), kind in 0u32..3, level in 0u32..70) {
-            let batch = v1::RecordBatch { namespace: vec![0; 32].into(), kind, level, records: bytes.into() };
+            let batch = v1::RecordBatch { namespace: vec![0; 32].into(), kind, level, records: bytes.into(), step: 0 };
             if let Ok((_, _, records)) = unpack::<Irradiance>(&batch) {
                 for record in records {
                     prop_assert!(record.check().is_ok());
@@ -162,6 +164,7 @@ mod tests {
             kind: Irradiance::KIND,
             level: 1,
             records: records.into(),
+            step: 0,
         };
         let message = |b: &v1::RecordBatch| unpack::<Irradiance>(b).expect_err("unsound").to_string();
         assert!(message(&batch(vec![0; 113])).starts_with("record 0 of the batch: normal"));

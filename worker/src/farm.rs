@@ -397,7 +397,8 @@ impl Worker {
             async move { frames.describe(v1::DescribeRequest { frame: id }).await }
         });
         let described = described.await?;
-        let loading = tokio::task::spawn_blocking(move || prepare(&described));
+        let spec = described.spec.ok_or_else(|| Fault::Unfit("the server described nothing".into()))?;
+        let loading = tokio::task::spawn_blocking(move || prepare(&spec));
         let frame = loading.await.map_err(|panic| Fault::Unfit(format!("the worker failed: {panic}")))?;
         let frame = frame.map_err(|e| Fault::Unfit(format!("{e:#}")))?;
         let (namespace, levels) = (*frame.namespace(), frame.levels());

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use cache_core::{Irradiance, Namespace};
+use cache_core::{Irradiance, Namespace, Tag};
 use cache_proto::{convert, v1};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -111,10 +111,11 @@ impl Feed {
 
     async fn subscribe(&mut self) -> Result<(), Status> {
         let position = *self.position.borrow();
-        let request = v1::SubscribeRequest { namespace: self.namespace.0.to_vec().into(), position };
+        let request =
+            v1::SubscribeRequest { namespace: self.namespace.0.to_vec().into(), position, ..Default::default() };
         let mut stream = self.cache.subscribe(request).await?.into_inner();
         while let Some(response) = stream.message().await? {
-            let batch = response.batch.ok_or_else(|| Status::internal("subscription without a batch"))?;
+            let Some(batch) = response.batch else { continue };
             self.received.fetch_add(batch.records.len() as u64, Ordering::Relaxed);
             let replica = self.replica.clone();
             // Off the runtime: checking takes CPU time, and others hold the lock while they copy.
@@ -130,12 +131,12 @@ impl Feed {
     }
 }
 
-/// Inserts (level, record) pairs, each level's in batches, and waits until the server keeps them. Says how many bytes of
+/// Inserts records, each tag's in batches, and waits until the server keeps them. Says how many bytes of
 /// records it sent. Repeating it is harmless.
 ///
 /// # Errors
 /// The server's.
-pub async fn insert(cache: &mut Cache, namespace: &Namespace, records: &[(u32, Irradiance)]) -> Result<u64, Status> {
+pub async fn insert(cache: &mut Cache, namespace: &Namespace, records: &[(Tag, Irradiance)]) -> Result<u64, Status> {
     let mut batches = Vec::new();
     for run in records.chunk_by(|a, b| a.0 == b.0) {
         for part in run.chunks(convert::BATCH_RECORDS_MAX) {

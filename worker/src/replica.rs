@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use cache_core::id::Digest;
 use cache_core::set::Inserted;
-use cache_core::{Irradiance, Namespace, RecordId, RecordSet, Sealed};
+use cache_core::{Irradiance, Namespace, RecordId, RecordSet, Sealed, Tag};
 use cache_proto::{convert, v1};
 
 use crate::frame::Levels;
@@ -77,7 +77,7 @@ impl Replica {
     }
 
     /// All records with their levels, in the order of the log.
-    pub fn log(&self) -> &[(u32, Irradiance)] {
+    pub fn log(&self) -> &[(Tag, Irradiance)] {
         self.set.since(0)
     }
 
@@ -87,7 +87,7 @@ impl Replica {
     /// # Errors
     /// A batch that is malformed, of another namespace, or leaves a gap; nothing of it is used.
     pub fn apply(&mut self, position: u64, batch: &v1::RecordBatch) -> Result<u64, ReplicaError> {
-        let (namespace, level, records) =
+        let (namespace, tag, records) =
             convert::unpack::<Irradiance>(batch).map_err(|e| ReplicaError::Malformed(e.to_string()))?;
         if namespace != self.namespace {
             return Err(ReplicaError::Malformed("it is of another namespace".into()));
@@ -97,7 +97,7 @@ impl Replica {
         };
         for record in records.into_iter().skip(usize::try_from(known).unwrap_or(usize::MAX)) {
             let at = self.set.position();
-            match self.set.insert(level, record) {
+            match self.set.insert(tag, record) {
                 Inserted::Added => {}
                 Inserted::Replaced => drop(self.replaced.insert(at)),
                 Inserted::Known => return Err(ReplicaError::Repeated(at as u64)),
@@ -132,7 +132,7 @@ pub struct Part {
     to: u64,
     /// These are all records: start from empty caches.
     anew: bool,
-    records: Vec<(u32, Irradiance)>,
+    records: Vec<(Tag, Irradiance)>,
 }
 
 /// The caches of one frame, sealed from a prefix of its namespace's log.
@@ -177,7 +177,7 @@ impl Caches {
             self.levels.fill_with(|| Arc::new(Sealed::new(self.a)));
         }
         for (level, sealed) in (1..).zip(&mut self.levels) {
-            let of_level: Vec<_> = part.records.iter().filter(|(l, _)| *l == level).map(|(_, r)| *r).collect();
+            let of_level: Vec<_> = part.records.iter().filter(|(t, _)| t.level == level).map(|(_, r)| *r).collect();
             if !of_level.is_empty() {
                 Arc::make_mut(sealed).extend(of_level);
             }
@@ -188,7 +188,7 @@ impl Caches {
 }
 
 /// Each id's last entry in a piece of the log, which is the one that counts.
-fn latest(log: &[(u32, Irradiance)]) -> Vec<(u32, Irradiance)> {
+fn latest(log: &[(Tag, Irradiance)]) -> Vec<(Tag, Irradiance)> {
     let last: HashMap<RecordId, usize> = log.iter().enumerate().map(|(at, (_, r))| (r.id, at)).collect();
     log.iter().enumerate().filter(|(at, (_, r))| last[&r.id] == *at).map(|(_, entry)| *entry).collect()
 }
@@ -204,7 +204,7 @@ mod tests {
     const NAMESPACE: Namespace = Namespace([7; 32]);
 
     /// Few ids, so that replacements are common; the same level for an id mostly.
-    fn entries() -> impl Strategy<Value = Vec<(u32, Irradiance)>> {
+    fn entries() -> impl Strategy<Value = Vec<(Tag, Irradiance)>> {
         let one =
             (0u128..24, 1u32..4, prop::array::uniform3(0f32..2.0), 0.2f32..2.0).prop_map(|(id, level, p, radius)| {
                 let record = Irradiance {
@@ -224,7 +224,7 @@ mod tests {
     }
 
     /// The server's side: its log and the digest of every prefix.
-    fn server(entries: &[(u32, Irradiance)]) -> (Vec<(u32, Irradiance)>, Vec<Digest>) {
+    fn server(entries: &[(Tag, Irradiance)]) -> (Vec<(Tag, Irradiance)>, Vec<Digest>) {
         let (mut set, mut digests) = (RecordSet::default(), vec![Digest::default()]);
         for (level, record) in entries {
             if set.insert(*level, *record) != Inserted::Known {
@@ -234,7 +234,7 @@ mod tests {
         (set.since(0).to_vec(), digests)
     }
 
-    fn feed(replica: &mut Replica, log: &[(u32, Irradiance)], from: usize) {
+    fn feed(replica: &mut Replica, log: &[(Tag, Irradiance)], from: usize) {
         for (at, (level, record)) in log.iter().enumerate().skip(from) {
             replica.apply(at as u64, &convert::pack(&NAMESPACE, *level, [record])).expect("sound batch");
         }

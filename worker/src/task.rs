@@ -2,8 +2,8 @@
 
 use std::ops::Range;
 
-use cache_core::Irradiance;
 use cache_core::rounds::Step;
+use cache_core::{Irradiance, Tag};
 use cache_proto::{convert, v1};
 
 use crate::frame::{Counts, Frame, Levels};
@@ -11,8 +11,8 @@ use crate::frame::{Counts, Frame, Levels};
 /// What came of a lease.
 #[derive(Default)]
 pub struct Done {
-    /// New records with their level.
-    pub records: Vec<(u32, Irradiance)>,
+    /// New records.
+    pub records: Vec<(Tag, Irradiance)>,
     /// Finished tiles.
     pub tiles: Vec<v1::FrameTile>,
     counts: Counts,
@@ -37,7 +37,7 @@ pub fn run(
         let counts = match convert::plan_step(step) {
             Step::Fill { level, pass, ranks } => {
                 let (records, counts) = frame.fill(level, pass, ranks, tile, levels);
-                done.records.extend(records.into_iter().map(|r| (level, r)));
+                done.records.extend(records.into_iter().map(|r| (Tag { level, step: step.index }, r)));
                 counts
             }
             Step::Pixels => {
