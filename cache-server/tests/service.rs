@@ -135,15 +135,15 @@ async fn what_is_inserted_is_streamed_counted_and_digested() {
         let again = insert(&mut cache, batches).await.expect("harmless");
         assert_eq!((again.added, again.position), (0, 5000));
 
-        let expected: Vec<_> = (0..5000).map(|id| (if id < 4096 { 1 } else { 2 }, record(id))).collect();
+        let expected: Vec<_> = (0..5000).map(|id| (Tag::level(if id < 4096 { 1 } else { 2 }), record(id))).collect();
         assert_eq!(read(&mut early, 0, 5000).await, expected);
         let mut late = soon(cache.subscribe(subscribe(4990))).await.expect("accepted").into_inner();
         assert_eq!(read(&mut late, 4990, 10).await, expected[4990..]);
 
         let info = soon(cache.info(v1::InfoRequest {})).await.expect("info").into_inner();
         let mut set = cache_core::RecordSet::default();
-        for (level, record) in expected {
-            set.insert(level, record);
+        for (tag, record) in expected {
+            set.insert(tag, record);
         }
         assert_eq!((info.version.as_str(), info.subscribers, info.namespaces.len()), (VERSION, 2, 1));
         assert_eq!((info.namespaces[0].records, info.namespaces[0].conflicts), (5000, 0));
