@@ -1,7 +1,7 @@
 //! Id to record: the grow-only set every replica holds. Union is the only merge: idempotent, commutative, associative.
 
 use std::collections::hash_map::Entry;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use crate::cached::Cached;
 use crate::id::{Digest, RecordId};
@@ -70,12 +70,14 @@ pub struct RecordSet<C> {
     index: HashMap<RecordId, usize>,
     /// What each step gathered.
     steps: BTreeMap<u32, Sum>,
+    /// Positions whose record took the place of an earlier one.
+    replaced: BTreeSet<usize>,
     conflicts: u64,
 }
 
 impl<C> Default for RecordSet<C> {
     fn default() -> Self {
-        Self { log: Vec::new(), index: HashMap::new(), steps: BTreeMap::new(), conflicts: 0 }
+        Self { log: Vec::new(), index: HashMap::new(), steps: BTreeMap::new(), replaced: BTreeSet::new(), conflicts: 0 }
     }
 }
 
@@ -102,6 +104,7 @@ impl<C: Cached> RecordSet<C> {
                     }
                     self.steps.entry(tag.step).or_default().add(id);
                     slot.insert(position);
+                    self.replaced.insert(position);
                     self.log.push((tag, record));
                     return Inserted::Replaced;
                 }
@@ -152,6 +155,33 @@ impl<C: Cached> RecordSet<C> {
     /// The records of steps before `step`.
     pub fn before(&self, step: u32) -> Sum {
         self.steps.range(..step).map(|(_, sum)| *sum).fold(Sum::default(), Sum::and)
+    }
+
+    /// The records before a position of the log. Takes time with the position.
+    pub fn prefix(&self, position: usize) -> Sum {
+        self.prefixes().nth(position).unwrap_or_else(|| self.sum())
+    }
+
+    /// The shortest beginning of the log whose records have this digest: where it ends.
+    pub fn find(&self, digest: Digest) -> Option<usize> {
+        self.prefixes().position(|sum| sum.digest == digest)
+    }
+
+    /// Positions of the log whose record took the place of an earlier one.
+    pub fn replaced(&self) -> &BTreeSet<usize> {
+        &self.replaced
+    }
+
+    /// The records before positions 0, 1, ... of the log.
+    fn prefixes(&self) -> impl Iterator<Item = Sum> {
+        let mut sum = Sum::default();
+        let next = move |(at, (_, record)): (usize, &(Tag, C))| {
+            if !self.replaced.contains(&at) {
+                sum.add(record.id());
+            }
+            sum
+        };
+        std::iter::once(Sum::default()).chain(self.log.iter().enumerate().map(next))
     }
 
     /// Order-free digest of the ids.
@@ -244,6 +274,14 @@ mod tests {
         assert_eq!(set.insert(ONE, at(1.0)), Inserted::Known);
         assert_eq!(set.level(1).next().map(|r| r.position.x), Some(2.0));
         assert_eq!((set.len(), set.position(), set.conflicts()), (1, 2, 2));
+        assert_eq!((set.prefix(0).records, set.prefix(1), set.prefix(2)), (0, set.sum(), set.sum()));
+    }
+
+    #[test]
+    fn a_beginning_of_the_log_is_found_by_its_digest() {
+        let null = |id| Null { id: RecordId(id), position: Vec3::ZERO, radius: 1.0 };
+        let set = union(&[&[null(4), null(1), null(9)]]);
+        assert_eq!([0, 4, 5, 14, 9].map(|digest| set.find(Digest(digest))), [Some(0), Some(1), Some(2), Some(3), None]);
     }
 
     #[test]

@@ -36,6 +36,19 @@ pub enum Malformed {
     /// A level no record can have.
     #[error("level is {0}, expected 1 to 64")]
     Level(u32),
+    /// An entry that says nothing this build understands.
+    #[error("entry of an unknown kind: made by a newer build?")]
+    Unknown,
+    /// A text that is too long.
+    #[error("{field} has {got} bytes, expected at most {most}")]
+    Long {
+        /// Which.
+        field: &'static str,
+        /// What there was.
+        got: usize,
+        /// What would have been right.
+        most: usize,
+    },
     /// More records than one batch may carry.
     #[error("batch has {0} bytes of records, expected at most 4096 records")]
     TooMany(usize),
@@ -111,6 +124,54 @@ pub fn unpack<C: Cached>(batch: &v1::RecordBatch) -> Result<(Namespace, Tag, Vec
     let record = |(index, bytes)| C::decode(bytes).map_err(|reason| Malformed::Record { index, reason });
     let records = batch.records.chunks(C::BYTES).enumerate().map(record).collect::<Result<_, _>>()?;
     Ok((namespace, Tag { level: batch.level, step: batch.step }, records))
+}
+
+/// An entry of a store whose parts are sound.
+#[derive(Clone, PartialEq, Debug)]
+pub enum Checked<C> {
+    /// Records of a namespace.
+    Batch(Namespace, Tag, Vec<C>),
+    /// What a namespace is; second, for a draft, whose.
+    Label(Namespace, Option<Namespace>, v1::Label),
+    /// A draft belongs to a namespace from now on.
+    Publication {
+        /// Whose records.
+        draft: Namespace,
+        /// Where they belong.
+        namespace: Namespace,
+    },
+}
+
+/// Reads and checks an entry.
+///
+/// # Errors
+/// The first thing that is not sound. Nothing of an unsound entry is used.
+pub fn entry<C: Cached>(entry: &v1::Entry) -> Result<Checked<C>, Malformed> {
+    match &entry.entry {
+        Some(v1::entry::Entry::Batch(batch)) => {
+            let (namespace, tag, records) = unpack(batch)?;
+            Ok(Checked::Batch(namespace, tag, records))
+        }
+        Some(v1::entry::Entry::Label(label)) => {
+            for (field, text, most) in
+                [("scene", &label.scene, 4096), ("method", &label.method, 64), ("owner", &label.owner, 64)]
+            {
+                if text.len() > most {
+                    return Err(Malformed::Long { field, got: text.len(), most });
+                }
+            }
+            if label.scene_hash.len() > 32 {
+                return Err(Malformed::Long { field: "scene_hash", got: label.scene_hash.len(), most: 32 });
+            }
+            let draft_of = (!label.draft_of.is_empty()).then(|| namespace(&label.draft_of)).transpose()?;
+            Ok(Checked::Label(namespace(&label.namespace)?, draft_of, label.clone()))
+        }
+        Some(v1::entry::Entry::Publication(publication)) => Ok(Checked::Publication {
+            draft: namespace(&publication.draft)?,
+            namespace: namespace(&publication.namespace)?,
+        }),
+        None => Err(Malformed::Unknown),
+    }
 }
 
 /// What a step of the plan looks like on the wire, sealed at a position of the namespace's log.
