@@ -9,6 +9,18 @@ use rand_pcg::Mcg128Xsl64;
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct Namespace(pub [u8; 32]);
 
+impl Namespace {
+    /// The draft of a frame: a namespace for what it gathers until it is filled. `base` are the records of this namespace
+    /// it reads, `view` everything else that decides which records it needs.
+    pub fn draft(&self, base: Digest, view: &[u8]) -> Self {
+        let mut hasher = blake3::Hasher::new_derive_key("ambience draft v1");
+        hasher.update(&self.0);
+        hasher.update(&base.0.to_le_bytes());
+        hasher.update(view);
+        Self(*hasher.finalize().as_bytes())
+    }
+}
+
 /// Identity of a record: 128 bits of BLAKE3.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct RecordId(pub u128);

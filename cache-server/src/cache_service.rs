@@ -1,5 +1,6 @@
 //! The `Cache` service: records in, records out, answers.
 
+use std::collections::VecDeque;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
@@ -12,11 +13,15 @@ use tokio_stream::Stream;
 use tokio_stream::wrappers::WatchStream;
 use tonic::{Request, Response, Status, Streaming};
 
+use crate::access::{Tenant, tenant};
 use crate::frames_service::Board;
 use crate::query::Queries;
 use crate::refusal::Refusal;
 use crate::replica::Added;
-use crate::store::{Counted, Store};
+use crate::store::{Counted, Keeping, Store};
+
+/// Most batches of one insert that wait to become durable.
+const UNDER_WAY_MAX: usize = 8;
 
 /// Implements `Cache` over a store.
 pub struct CacheService {
@@ -38,43 +43,94 @@ impl Cache for CacheService {
         &self,
         request: Request<Streaming<v1::InsertRequest>>,
     ) -> Result<Response<v1::InsertResponse>, Status> {
+        let tenant = tenant(&request);
         let mut batches = request.into_inner();
-        let (mut total, mut index) = (Added::default(), 0);
+        let mut insert = Insert::default();
         while let Some(request) = batches.message().await? {
             let batch = request.batch.ok_or(Refusal::Malformed(Malformed::Missing("batch")));
-            let added = batch.and_then(|batch| self.store.insert(&batch));
-            let added = added.map_err(|reason| Refusal::Batch { index, reason: Box::new(reason) })?;
-            total = Added { added: total.added + added.added, position: added.position };
-            index += 1;
+            let queued = match batch {
+                Ok(batch) => self.store.insert(tenant.name(), batch).await,
+                Err(refusal) => Err(refusal),
+            };
+            insert.queued(queued).await?;
         }
+        let total = insert.end().await?;
         Ok(Response::new(v1::InsertResponse { added: total.added, position: total.position }))
     }
 
     type SubscribeStream = Subscription;
 
     async fn subscribe(&self, request: Request<v1::SubscribeRequest>) -> Result<Response<Subscription>, Status> {
-        let v1::SubscribeRequest { namespace, position, digest: _ } = request.into_inner();
+        let tenant = tenant(&request);
+        let v1::SubscribeRequest { namespace, position, digest } = request.into_inner();
         let namespace = convert::namespace(&namespace).map_err(Refusal::from)?;
-        let subscription = Subscription::new(&self.store, namespace, position);
+        let position = if digest.is_empty() {
+            position
+        } else {
+            let digest = convert::digest(&digest).map_err(Refusal::from)?;
+            self.store.replica().resume(&namespace, position, digest)
+        };
+        let subscription = Subscription::new(&self.store, tenant, namespace, position);
         // Told before the stream begins, so that the client learns it from the call itself.
+        self.store.replica().belongs(&namespace, subscription.tenant.name())?;
         self.store.replica().since(&namespace, position)?;
         Ok(Response::new(subscription))
     }
 
     async fn query(&self, request: Request<v1::QueryRequest>) -> Result<Response<v1::QueryResponse>, Status> {
-        let answers = self.queries.answer(request.get_ref()).await?;
+        let answers = self.queries.answer(tenant(&request).name(), request.get_ref()).await?;
         Ok(Response::new(v1::QueryResponse { answers: answers.into() }))
     }
 
-    async fn info(&self, _: Request<v1::InfoRequest>) -> Result<Response<v1::InfoResponse>, Status> {
+    async fn info(&self, request: Request<v1::InfoRequest>) -> Result<Response<v1::InfoResponse>, Status> {
         let (frames, workers) = self.board.census();
         Ok(Response::new(v1::InfoResponse {
             version: cache_proto::VERSION.into(),
-            namespaces: self.store.replica().info(),
+            namespaces: self.store.replica().info(tenant(&request).name()),
             subscribers: self.store.subscribers(),
             workers,
             frames,
         }))
+    }
+}
+
+/// An insert under way: batches are checked and queued while those before them become durable.
+#[derive(Default)]
+struct Insert {
+    index: u64,
+    under_way: VecDeque<Keeping>,
+    total: Added,
+}
+
+impl Insert {
+    async fn queued(&mut self, queued: Result<Keeping, Refusal>) -> Result<(), Refusal> {
+        match queued {
+            Ok(keeping) => self.under_way.push_back(keeping),
+            Err(reason) => {
+                // Those before it are kept, as the refusal says.
+                let index = self.index + self.under_way.len() as u64;
+                self.settle(0).await?;
+                return Err(Refusal::Batch { index, reason: Box::new(reason) });
+            }
+        }
+        self.settle(UNDER_WAY_MAX).await
+    }
+
+    async fn settle(&mut self, most: usize) -> Result<(), Refusal> {
+        while self.under_way.len() > most
+            && let Some(keeping) = self.under_way.pop_front()
+        {
+            let index = self.index;
+            let added = keeping.kept().await.map_err(|reason| Refusal::Batch { index, reason: Box::new(reason) })?;
+            self.total = Added { added: self.total.added + added.added, position: added.position };
+            self.index += 1;
+        }
+        Ok(())
+    }
+
+    async fn end(mut self) -> Result<Added, Refusal> {
+        self.settle(0).await?;
+        Ok(self.total)
     }
 }
 
@@ -83,15 +139,18 @@ impl Cache for CacheService {
 pub struct Subscription {
     store: Counted,
     grown: WatchStream<bool>,
+    tenant: Tenant,
     namespace: Namespace,
     position: u64,
+    /// The client was told where it starts.
+    started: bool,
     ended: bool,
 }
 
 impl Subscription {
-    fn new(store: &Arc<Store>, namespace: Namespace, position: u64) -> Self {
+    fn new(store: &Arc<Store>, tenant: Tenant, namespace: Namespace, position: u64) -> Self {
         let grown = WatchStream::from_changes(store.grown().listen());
-        Self { store: store.count_subscriber(), grown, namespace, position, ended: false }
+        Self { store: store.count_subscriber(), grown, tenant, namespace, position, started: false, ended: false }
     }
 
     fn read(&mut self) -> Result<Option<v1::SubscribeResponse>, Refusal> {
@@ -99,8 +158,14 @@ impl Subscription {
         if store.grown().is_closed() {
             return Err(Refusal::Closing);
         }
-        let Some((count, batch)) = store.replica().read(&self.namespace, self.position)? else { return Ok(None) };
-        let position = self.position;
+        let (replica, position) = (store.replica(), self.position);
+        // It may have come to be since the subscription began.
+        replica.belongs(&self.namespace, self.tenant.name())?;
+        if !std::mem::replace(&mut self.started, true) {
+            let end = replica.mark(&self.namespace).position;
+            return Ok(Some(v1::SubscribeResponse { batch: None, position, end }));
+        }
+        let Some((count, batch)) = replica.read(&self.namespace, position)? else { return Ok(None) };
         self.position += count;
         Ok(Some(v1::SubscribeResponse { batch: Some(batch), position, end: 0 }))
     }

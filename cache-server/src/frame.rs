@@ -5,10 +5,12 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::time::Duration;
 
+use cache_core::Namespace;
 use cache_core::rounds::Plan;
 use cache_proto::v1::frame_event::Event;
 use cache_proto::{convert, v1};
 
+use crate::access::Tenant;
 use crate::refusal::Refusal;
 use crate::replica::Mark;
 use crate::round::{Held, Round};
@@ -44,11 +46,23 @@ pub enum News {
     End,
 }
 
+/// Whose a frame is, and what it reads.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct Origin {
+    /// Whose.
+    pub tenant: Tenant,
+    /// The records of its namespace it reads besides its own.
+    pub base: Mark,
+    /// Where its own records go.
+    pub draft: Namespace,
+}
+
 /// One frame.
 #[derive(Debug)]
 pub struct Frame {
     id: u64,
     job: Job,
+    origin: Origin,
     plan: Plan,
     /// The step at work; `None` when all are done.
     round: Option<Round>,
@@ -73,12 +87,13 @@ struct Outbox {
 }
 
 impl Frame {
-    /// A frame whose first step reads the namespace as of `mark`.
-    pub fn new(id: u64, job: Job, mark: Mark) -> Self {
+    /// A frame; `mark` tells the state of its draft, as far as the steps before the given one gathered it.
+    pub fn new(id: u64, job: Job, origin: Origin, mark: impl FnOnce(u32) -> Mark) -> Self {
         let mut frame = Self {
             id,
             plan: Plan::new(job.spec.levels),
             job,
+            origin,
             round: None,
             steps: 0,
             fills: 0,
@@ -94,6 +109,11 @@ impl Frame {
     /// What the frame asks for.
     pub fn job(&self) -> &Job {
         &self.job
+    }
+
+    /// Whose it is, and what it reads.
+    pub fn origin(&self) -> &Origin {
+        &self.origin
     }
 
     /// The step at work; `None` when all are done.
@@ -136,12 +156,12 @@ impl Frame {
         self.round.as_ref().map_or(0, |round| round.held_by(worker).count())
     }
 
-    /// Ends a lease: false when `worker` does not hold it any more, and then nothing of the request is used. A step
-    /// that begins by this reads the namespace as of `mark`.
+    /// Ends a lease: false when `worker` does not hold it any more, and then nothing of the request is used. `mark`
+    /// tells the state of the draft, as far as the steps before the given one gathered it.
     ///
     /// # Errors
     /// What is unsound about the request; the worker keeps the lease then.
-    pub fn complete(&mut self, request: v1::CompleteRequest, mark: impl FnOnce() -> Mark) -> Result<bool, Refusal> {
+    pub fn complete(&mut self, request: v1::CompleteRequest, mark: impl FnOnce(u32) -> Mark) -> Result<bool, Refusal> {
         let Some(round) = &mut self.round else { return Ok(false) };
         let Some(held) = round.held(request.lease, &request.worker) else { return Ok(false) };
         let expected = if round.makes_pixels() { held.tiles.clone() } else { 0..0 };
@@ -158,14 +178,15 @@ impl Frame {
         self.outbox.tiles.extend(request.tiles);
         if round.is_over() {
             let gathered = round.gathered();
-            self.advance(gathered, mark());
+            self.advance(gathered, mark);
         }
         Ok(true)
     }
 
-    fn advance(&mut self, gathered: u64, mark: Mark) {
+    fn advance(&mut self, gathered: u64, mark: impl FnOnce(u32) -> Mark) {
         self.round = self.plan.next(gathered).map(|step| {
-            let step = convert::step(self.steps, &step, mark.position, mark.digest);
+            let mark = mark(self.steps);
+            let step = convert::step(self.steps, &step, mark.position, mark.sum.digest);
             Round::new(step, self.job.tiles)
         });
         if let Some(round) = &self.round {
@@ -199,9 +220,9 @@ impl Frame {
         self.unfit.remove(worker);
     }
 
-    /// What the owner is told next; `mark` is the state of the frame's namespace. The second value is whether there
+    /// What the owner is told next; `mark` tells the state of the draft as in [`Self::complete`]. The second value is whether there
     /// is room for pixels again where there was none.
-    pub fn news(&mut self, workers: u32, mark: impl FnOnce() -> Mark) -> (News, bool) {
+    pub fn news(&mut self, workers: u32, mark: impl FnOnce(u32) -> Mark) -> (News, bool) {
         let blocked = self.room() == 0;
         let Some(event) = self.event(workers, mark) else {
             return (if self.outbox.ended { News::End } else { News::Wait }, false);
@@ -209,10 +230,15 @@ impl Frame {
         (News::Tell(Box::new(v1::FrameEvent { event: Some(event) })), blocked && self.room() > 0)
     }
 
-    fn event(&mut self, workers: u32, mark: impl FnOnce() -> Mark) -> Option<Event> {
+    fn event(&mut self, workers: u32, mark: impl FnOnce(u32) -> Mark) -> Option<Event> {
         let outbox = &mut self.outbox;
         if std::mem::take(&mut outbox.opening) {
-            return Some(Event::Opened(v1::FrameOpened { frame: self.id, ..Default::default() }));
+            let base = self.origin.base.sum;
+            return Some(Event::Opened(v1::FrameOpened {
+                frame: self.id,
+                base: convert::digest_bytes(base.digest),
+                base_records: base.records,
+            }));
         }
         if let Some(declined) = outbox.declined.pop_front() {
             return Some(Event::Declined(declined));
@@ -223,7 +249,7 @@ impl Frame {
                 step: Some(round.step().clone()),
                 tiles_done: round.done_tiles(),
                 tiles_total: round.tiles(),
-                records: mark().records,
+                records: self.origin.base.sum.records + mark(u32::MAX).sum.records,
                 workers,
             }));
         }
@@ -234,13 +260,14 @@ impl Frame {
         if self.round.is_some() || std::mem::replace(&mut outbox.ended, true) {
             return None;
         }
-        let mark = mark();
+        // The last step made the pixels; what it read is what the steps before it gathered.
+        let read = self.origin.base.sum.and(mark(self.steps.saturating_sub(1)).sum);
         let count = |(name, value): (&String, &f64)| v1::Count { name: name.clone(), value: *value };
         Some(Event::Done(v1::FrameDone {
             rounds: self.fills,
             leases_lost: self.leases_lost,
-            digest: convert::digest_bytes(mark.digest),
-            records: mark.records,
+            digest: convert::digest_bytes(read.digest),
+            records: read.records,
             counts: self.counts.iter().map(count).collect(),
         }))
     }

@@ -8,10 +8,11 @@ use std::time::Duration;
 use cache_core::Namespace;
 use cache_proto::v1;
 
-use crate::frame::{Frame, News};
+use crate::access::Tenant;
+use crate::frame::{Frame, News, Origin};
 use crate::refusal::Refusal;
 use crate::replica::Mark;
-use crate::spec::{self, Job};
+use crate::spec::Job;
 
 /// A lease that is neither completed nor renewed for this long is given to somebody else.
 pub const LEASE_TIME: Duration = Duration::from_secs(6);
@@ -35,6 +36,8 @@ pub struct Changes {
     pub work: bool,
     /// There may be something to tell: owners of frames.
     pub news: bool,
+    /// A draft is whole and may be published, and where to.
+    pub filled: Option<(Namespace, Namespace)>,
 }
 
 /// Every open frame, and every worker heard of lately.
@@ -48,6 +51,11 @@ pub struct Frames {
     changes: Changes,
 }
 
+/// Tells the state of a draft, as far as the steps before the given one gathered it.
+pub trait Marks: FnOnce(&Namespace, u32) -> Mark {}
+
+impl<F: FnOnce(&Namespace, u32) -> Mark> Marks for F {}
+
 impl Frames {
     /// No frames yet; numbers of frames and leases count up from `first`. A server that restarts should begin
     /// elsewhere, or a worker that lived on could complete a lease it was never given.
@@ -55,18 +63,17 @@ impl Frames {
         Self { frames: BTreeMap::new(), workers: BTreeMap::new(), next: first, changes: Changes::default() }
     }
 
-    /// Opens a frame; `mark` tells the state of a namespace. Returns the frame's number.
+    /// Opens a frame. Returns its number.
     ///
     /// # Errors
-    /// The field that is outside its range, or [`Refusal::Full`].
-    pub fn open(&mut self, spec: v1::FrameSpec, mark: impl FnOnce(&Namespace) -> Mark) -> Result<u64, Refusal> {
-        let job = Job::check(spec)?;
+    /// [`Refusal::Full`].
+    pub fn open(&mut self, job: Job, origin: Origin, mark: impl Marks) -> Result<u64, Refusal> {
         if self.frames.len() >= FRAMES_MAX {
             return Err(Refusal::Full { what: "frames", most: FRAMES_MAX });
         }
-        let (id, mark) = (self.number(), mark(&job.namespace));
-        self.frames.insert(id, Frame::new(id, job, mark));
-        self.changes = Changes { work: true, news: true };
+        let (id, draft) = (self.number(), origin.draft);
+        self.frames.insert(id, Frame::new(id, job, origin, |step| mark(&draft, step)));
+        (self.changes.work, self.changes.news) = (true, true);
         Ok(id)
     }
 
@@ -75,26 +82,29 @@ impl Frames {
         self.frames.remove(&frame);
     }
 
-    /// What to render.
+    /// A tenant's frame.
     ///
     /// # Errors
     /// [`Refusal::NoFrame`].
-    pub fn describe(&self, frame: u64) -> Result<&v1::FrameSpec, Refusal> {
-        self.frames.get(&frame).map(|frame| &frame.job().spec).ok_or(Refusal::NoFrame(frame))
+    pub fn frame(&self, tenant: &Tenant, frame: u64) -> Result<&Frame, Refusal> {
+        let own = self.frames.get(&frame).filter(|frame| frame.origin().tenant == *tenant);
+        own.ok_or(Refusal::NoFrame(frame))
     }
 
-    /// Work for a worker, from the oldest frame that has some. `None`: nothing now, ask again after the next change.
+    /// Work for a tenant's worker, from the oldest frame that has some. `None`: nothing now, ask again after the next
+    /// change.
     ///
     /// # Errors
     /// [`Refusal::Full`] when there are too many workers, or this one holds too many leases.
-    pub fn lease(&mut self, worker: &str, now: Duration) -> Result<Option<v1::Lease>, Refusal> {
+    pub fn lease(&mut self, tenant: &Tenant, worker: &str, now: Duration) -> Result<Option<v1::Lease>, Refusal> {
         let worker = self.hear(worker, now)?;
         if self.frames.values().map(|frame| frame.held_by(&worker)).sum::<usize>() >= LEASES_MAX {
             return Err(Refusal::Full { what: "leases of one worker", most: LEASES_MAX });
         }
         let workers = self.workers.len() as u32;
         let (number, deadline) = (self.number(), now + LEASE_TIME);
-        Ok(self.frames.values_mut().find_map(|frame| frame.lease(number, &worker, workers, deadline)))
+        let mut own = self.frames.values_mut().filter(|frame| frame.origin().tenant == *tenant);
+        Ok(own.find_map(|frame| frame.lease(number, &worker, workers, deadline)))
     }
 
     /// A worker says that it lives: its leases get a new deadline. Returns the leases it still holds.
@@ -105,28 +115,26 @@ impl Frames {
         self.frames.values_mut().flat_map(|frame| frame.renew(worker, now + LEASE_TIME)).collect()
     }
 
-    /// Ends a lease; `mark` tells the state of a namespace, for the step that may begin by this. False when the lease
-    /// was lost before, or completed: nothing of the request is used then.
+    /// Ends a lease. False when it was lost before, or completed: nothing of the request is used then.
     ///
     /// # Errors
     /// What is unsound about the request; the worker keeps the lease then.
-    pub fn complete(
-        &mut self,
-        request: v1::CompleteRequest,
-        now: Duration,
-        mark: impl FnOnce(&Namespace) -> Mark,
-    ) -> Result<bool, Refusal> {
+    pub fn complete(&mut self, request: v1::CompleteRequest, now: Duration, mark: impl Marks) -> Result<bool, Refusal> {
         if let Some(heard) = self.workers.get_mut(request.worker.as_str()) {
             *heard = now;
         }
         let Some(frame) = self.frames.get_mut(&request.frame) else { return Ok(false) };
-        let namespace = frame.job().namespace;
+        let draft = frame.origin().draft;
         let step = frame.round().map(|round| round.step().index);
-        let accepted = frame.complete(request, || mark(&namespace))?;
+        let accepted = frame.complete(request, |step| mark(&draft, step))?;
         self.changes.news |= accepted;
         // A lease of pixels that brought less than the most a tile can have leaves room for others.
         let pixels = frame.round().is_some_and(|round| round.makes_pixels());
-        self.changes.work |= accepted && (pixels || step != frame.round().map(|round| round.step().index));
+        let advanced = step != frame.round().map(|round| round.step().index);
+        self.changes.work |= accepted && (pixels || advanced);
+        if accepted && pixels && advanced {
+            self.changes.filled = Some((draft, frame.job().namespace));
+        }
         Ok(accepted)
     }
 
@@ -142,7 +150,7 @@ impl Frames {
         if let Some(frame) = self.frames.get_mut(&frame) {
             frame.decline(worker, reason);
         }
-        self.changes = Changes { work: true, news: true };
+        (self.changes.work, self.changes.news) = (true, true);
         Ok(())
     }
 
@@ -174,12 +182,12 @@ impl Frames {
         });
     }
 
-    /// What a frame's owner is told next; `mark` tells the state of a namespace.
-    pub fn news(&mut self, frame: u64, mark: impl FnOnce(&Namespace) -> Mark) -> News {
+    /// What a frame's owner is told next.
+    pub fn news(&mut self, frame: u64, mark: impl Marks) -> News {
         let workers = self.workers.len() as u32;
         let Some(frame) = self.frames.get_mut(&frame) else { return News::End };
-        let namespace = frame.job().namespace;
-        let (news, room) = frame.news(workers, || mark(&namespace));
+        let draft = frame.origin().draft;
+        let (news, room) = frame.news(workers, |step| mark(&draft, step));
         self.changes.work |= room;
         news
     }
@@ -206,7 +214,6 @@ impl Frames {
     }
 
     fn hear(&mut self, worker: &str, now: Duration) -> Result<Arc<str>, Refusal> {
-        spec::worker_name(worker)?;
         if self.workers.len() >= WORKERS_MAX && !self.workers.contains_key(worker) {
             return Err(Refusal::Full { what: "workers", most: WORKERS_MAX });
         }

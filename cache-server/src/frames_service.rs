@@ -6,24 +6,31 @@ use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use cache_core::Namespace;
-use cache_proto::convert::Malformed;
+use cache_core::id::Digest;
+use cache_proto::convert::{self, Malformed};
 use cache_proto::v1;
 use cache_proto::v1::frames_server::Frames as FramesTrait;
+use prost::Message as _;
 use tokio_stream::Stream;
 use tokio_stream::wrappers::WatchStream;
 use tonic::{Request, Response, Status};
 
+use crate::access::{Tenant, tenant};
 use crate::bell::Bell;
 use crate::clock::Clock;
-use crate::frame::News;
-use crate::frames::Frames;
+use crate::frame::{News, Origin};
+use crate::frames::{Changes, Frames};
 use crate::refusal::{Refusal, same_version};
 use crate::replica::Mark;
-use crate::spec;
+use crate::spec::{self, Job};
 use crate::store::{Store, lock};
 
 /// How long a worker waits for a lease before it is told to ask again.
 const LEASE_WAIT: Duration = Duration::from_secs(10);
+
+/// How long a frame that is opened again waits for the records it was begun with, when the server lost its own: workers
+/// bring them back.
+const REFILL_WAIT: Duration = Duration::from_secs(10);
 
 /// The frames shared between tasks, with the bells that tell of work and news.
 ///
@@ -61,6 +68,10 @@ impl Board {
 
     /// One transition; then wakes whom it concerns.
     fn change<T>(&self, transition: impl FnOnce(&mut Frames, Duration) -> T) -> T {
+        self.change_and(transition).0
+    }
+
+    fn change_and<T>(&self, transition: impl FnOnce(&mut Frames, Duration) -> T) -> (T, Changes) {
         let (result, changes) = {
             let mut frames = lock(&self.frames);
             let result = transition(&mut frames, self.clock.now());
@@ -72,15 +83,63 @@ impl Board {
         if changes.news {
             self.news.ring();
         }
-        result
+        (result, changes)
     }
 
-    fn mark(&self, namespace: &Namespace) -> Mark {
-        self.store.mark(namespace)
+    fn mark(&self, draft: &Namespace, step: u32) -> Mark {
+        self.store.replica().mark_before(draft, step)
+    }
+
+    /// Opens a frame of a tenant: finds its base, begins its draft. Returns its number.
+    async fn open(&self, tenant: &Tenant, request: v1::OpenRequest) -> Result<(u64, Namespace), Refusal> {
+        let v1::OpenRequest { spec, version, base } = request;
+        same_version(&version)?;
+        let job = Job::check(spec.ok_or(Refusal::Malformed(Malformed::Missing("spec")))?)?;
+        let namespace = job.namespace;
+        self.store.replica().belongs(&namespace, tenant.name())?;
+        let base = if base.is_empty() {
+            self.store.mark(&namespace)
+        } else {
+            self.base(&namespace, convert::digest(&base)?).await
+        };
+        let view = v1::FrameSpec { scene: String::new(), spp: 0, ..job.spec.clone() };
+        let view = [view.encode_to_vec(), cache_proto::VERSION.into()].concat();
+        let draft = namespace.draft(base.sum.digest, &view);
+        if job.spec.levels > 0 {
+            self.store.label(label(&job, tenant.name(), namespace, None)).await?;
+            self.store.label(label(&job, tenant.name(), draft, Some(namespace))).await?;
+        }
+        let origin = Origin { tenant: tenant.clone(), base, draft };
+        self.store.hold(draft);
+        let opened = self.change(|frames, _| frames.open(job, origin, |draft, step| self.mark(draft, step)));
+        if opened.is_err() {
+            self.store.release(&draft);
+        }
+        Ok((opened?, draft))
+    }
+
+    /// The beginning of a namespace's log that has this digest. If it does not come up in time, the whole log.
+    async fn base(&self, namespace: &Namespace, digest: Digest) -> Mark {
+        let mut grown = self.store.grown().listen();
+        let wait = tokio::time::sleep(REFILL_WAIT);
+        tokio::pin!(wait);
+        loop {
+            // The whole log is by far the most likely, and looking for its beginnings takes time.
+            let whole = self.store.mark(namespace);
+            let found =
+                if whole.sum.digest == digest { Some(whole) } else { self.store.replica().find(namespace, digest) };
+            if let Some(mark) = found {
+                return mark;
+            }
+            tokio::select! {
+                _ = grown.changed(), if !self.store.grown().is_closed() => (),
+                () = &mut wait => return self.store.mark(namespace),
+            }
+        }
     }
 
     /// Waits for work; `None` when none came up in time.
-    async fn lease(&self, worker: &str) -> Result<Option<v1::Lease>, Refusal> {
+    async fn lease(&self, tenant: &Tenant, worker: &str) -> Result<Option<v1::Lease>, Refusal> {
         let mut work = self.work.listen();
         let wait = tokio::time::sleep(LEASE_WAIT);
         tokio::pin!(wait);
@@ -88,7 +147,7 @@ impl Board {
             if self.work.is_closed() {
                 return Err(Refusal::Closing);
             }
-            if let Some(lease) = self.change(|frames, now| frames.lease(worker, now))? {
+            if let Some(lease) = self.change(|frames, now| frames.lease(tenant, worker, now))? {
                 return Ok(Some(lease));
             }
             tokio::select! {
@@ -114,53 +173,91 @@ impl FramesTrait for FramesService {
     type OpenStream = Owner;
 
     async fn open(&self, request: Request<v1::OpenRequest>) -> Result<Response<Owner>, Status> {
-        let v1::OpenRequest { spec, version, base: _ } = request.into_inner();
-        same_version(&version)?;
-        let spec = spec.ok_or(Refusal::Malformed(Malformed::Missing("spec")))?;
-        let frame = self.0.change(|frames, _| frames.open(spec, |namespace| self.0.mark(namespace)))?;
+        let tenant = tenant(&request);
+        let (frame, draft) = self.0.open(&tenant, request.into_inner()).await?;
         tracing::info!(frame, "frame opened");
-        Ok(Response::new(Owner::new(self.0.clone(), frame)))
+        Ok(Response::new(Owner::new(self.0.clone(), frame, draft)))
     }
 
     async fn describe(&self, request: Request<v1::DescribeRequest>) -> Result<Response<v1::DescribeResponse>, Status> {
-        let spec = lock(&self.0.frames).describe(request.get_ref().frame)?.clone();
-        Ok(Response::new(v1::DescribeResponse { spec: Some(spec), ..Default::default() }))
+        let frames = lock(&self.0.frames);
+        let frame = frames.frame(&tenant(&request), request.get_ref().frame)?;
+        let origin = frame.origin();
+        Ok(Response::new(v1::DescribeResponse {
+            spec: Some(frame.job().spec.clone()),
+            draft: origin.draft.0.to_vec().into(),
+            base_position: origin.base.position,
+            base_digest: convert::digest_bytes(origin.base.sum.digest),
+        }))
     }
 
     async fn lease(&self, request: Request<v1::LeaseRequest>) -> Result<Response<v1::LeaseResponse>, Status> {
+        let tenant = tenant(&request);
         let v1::LeaseRequest { worker, version } = request.into_inner();
         same_version(&version)?;
-        let lease = self.0.lease(&worker).await?;
+        let lease = self.0.lease(&tenant, &named(&tenant, &worker)?).await?;
         Ok(Response::new(v1::LeaseResponse { lease }))
     }
 
     async fn renew(&self, request: Request<v1::RenewRequest>) -> Result<Response<v1::RenewResponse>, Status> {
-        let worker = request.into_inner().worker;
-        spec::worker_name(&worker)?;
+        let worker = named(&tenant(&request), &request.get_ref().worker)?;
         let leases = self.0.change(|frames, now| frames.renew(&worker, now));
         Ok(Response::new(v1::RenewResponse { leases }))
     }
 
     async fn complete(&self, request: Request<v1::CompleteRequest>) -> Result<Response<v1::CompleteResponse>, Status> {
-        let request = request.into_inner();
-        spec::worker_name(&request.worker)?;
-        let mark = |namespace: &_| self.0.mark(namespace);
-        let accepted = self.0.change(|frames, now| frames.complete(request, now, mark))?;
+        let worker = named(&tenant(&request), &request.get_ref().worker)?;
+        let request = v1::CompleteRequest { worker, ..request.into_inner() };
+        let mark = |draft: &Namespace, step| self.0.mark(draft, step);
+        let (accepted, changes) = self.0.change_and(|frames, now| frames.complete(request, now, mark));
+        let accepted = accepted?;
+        if let Some((draft, namespace)) = changes.filled
+            && let Err(refusal) = self.0.store.publish(draft, namespace).await
+        {
+            // The picture does not need it, and a frame begun again finds the draft.
+            tracing::warn!("the records of a filled frame stay a draft: {refusal}");
+        }
         Ok(Response::new(v1::CompleteResponse { accepted }))
     }
 
     async fn decline(&self, request: Request<v1::DeclineRequest>) -> Result<Response<v1::DeclineResponse>, Status> {
+        let tenant = tenant(&request);
         let v1::DeclineRequest { worker, frame, reason } = request.into_inner();
+        let worker = named(&tenant, &worker)?;
+        lock(&self.0.frames).frame(&tenant, frame)?;
         self.0.change(|frames, now| frames.decline(&worker, frame, reason, now))?;
         Ok(Response::new(v1::DeclineResponse {}))
     }
 
     async fn leave(&self, request: Request<v1::LeaveRequest>) -> Result<Response<v1::LeaveResponse>, Status> {
-        let worker = request.into_inner().worker;
-        spec::worker_name(&worker)?;
+        let worker = named(&tenant(&request), &request.get_ref().worker)?;
         self.0.change(|frames, _| frames.leave(&worker));
         Ok(Response::new(v1::LeaveResponse {}))
     }
+}
+
+/// What a frame's namespace or draft is, for people.
+fn label(job: &Job, tenant: &str, namespace: Namespace, draft_of: Option<Namespace>) -> v1::Label {
+    let spec = &job.spec;
+    let name = std::path::Path::new(&spec.scene).file_name().and_then(|name| name.to_str()).unwrap_or(&spec.scene);
+    v1::Label {
+        namespace: namespace.0.to_vec().into(),
+        scene: name.into(),
+        scene_hash: spec.scene_hash.clone(),
+        method: spec.method.clone(),
+        a: spec.a,
+        rays: spec.rays,
+        bounces: spec.bounces,
+        seed: spec.seed,
+        owner: tenant.into(),
+        draft_of: draft_of.map_or_else(Default::default, |namespace| namespace.0.to_vec().into()),
+    }
+}
+
+/// A worker's name among those of all tenants.
+fn named(tenant: &Tenant, worker: &str) -> Result<String, Refusal> {
+    spec::worker_name(worker)?;
+    Ok(if tenant.name().is_empty() { worker.into() } else { format!("{}/{worker}", tenant.name()) })
 }
 
 /// What the owner of a frame hears. Dropping it cancels the frame.
@@ -168,20 +265,21 @@ pub struct Owner {
     board: Arc<Board>,
     news: WatchStream<bool>,
     frame: u64,
+    draft: Namespace,
     ended: bool,
 }
 
 impl Owner {
-    fn new(board: Arc<Board>, frame: u64) -> Self {
+    fn new(board: Arc<Board>, frame: u64, draft: Namespace) -> Self {
         let news = WatchStream::from_changes(board.news.listen());
-        Self { board, news, frame, ended: false }
+        Self { board, news, frame, draft, ended: false }
     }
 
     fn look(&self) -> Result<News, Refusal> {
         if self.board.news.is_closed() {
             return Err(Refusal::Closing);
         }
-        Ok(self.board.change(|frames, _| frames.news(self.frame, |namespace| self.board.mark(namespace))))
+        Ok(self.board.change(|frames, _| frames.news(self.frame, |draft, step| self.board.mark(draft, step))))
     }
 }
 
@@ -207,6 +305,7 @@ impl Stream for Owner {
 impl Drop for Owner {
     fn drop(&mut self) {
         self.board.change(|frames, _| frames.close(self.frame));
+        self.board.store.release(&self.draft);
         tracing::info!(frame = self.frame, "frame closed");
     }
 }

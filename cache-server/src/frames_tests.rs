@@ -80,7 +80,7 @@ struct Farm {
 impl Farm {
     fn new(levels: u32) -> Self {
         let mut frames = Frames::new(1);
-        let frame = frames.open(spec(TILES, levels), |_| Mark::default()).expect("sound");
+        let frame = opened(&mut frames, spec(TILES, levels)).expect("room");
         Self {
             frames,
             frame,
@@ -147,7 +147,7 @@ impl Farm {
     }
 
     fn lease(&mut self, worker: &str) -> bool {
-        let Some(lease) = self.frames.lease(worker, self.now).expect("room") else { return false };
+        let Some(lease) = self.frames.lease(&Tenant::default(), worker, self.now).expect("room") else { return false };
         self.log.set(self.log.get() + 1);
         let step = lease.step.clone().expect("a step");
         assert!(lease.tile_from < lease.tile_to && lease.tile_to <= TILES);
@@ -174,7 +174,7 @@ impl Farm {
             counts: vec![v1::Count { name: "rays".into(), value: tiles.len() as f64 }],
         };
         let position = self.log.get();
-        let mark = |_: &Namespace| Mark { position, ..Mark::default() };
+        let mark = |_: &Namespace, _| Mark { position, ..Mark::default() };
         let accepted = self.frames.complete(request, self.now, mark).expect("sound");
         if accepted {
             let seen = self.steps.get_mut(&step.index).expect("leased before");
@@ -187,7 +187,7 @@ impl Farm {
     }
 
     fn listen(&mut self) {
-        while let News::Tell(event) = self.frames.news(self.frame, |_| Mark::default()) {
+        while let News::Tell(event) = self.frames.news(self.frame, |_, _| Mark::default()) {
             assert!(self.done.is_none(), "nothing is told after the end");
             match event.event.expect("an event") {
                 Event::Tile(tile) => assert!(self.tiles.insert(tile.tile), "each tile is delivered once"),
@@ -230,11 +230,17 @@ proptest! {
 }
 
 fn lease(frames: &mut Frames, worker: &str, seconds: u64) -> Option<v1::Lease> {
-    frames.lease(worker, Duration::from_secs(seconds)).expect("room")
+    frames.lease(&Tenant::default(), worker, Duration::from_secs(seconds)).expect("room")
+}
+
+fn opened(frames: &mut Frames, spec: v1::FrameSpec) -> Result<u64, Refusal> {
+    let job = Job::check(spec).expect("sound");
+    let origin = Origin { tenant: Tenant::default(), base: Mark::default(), draft: job.namespace };
+    frames.open(job, origin, |_, _| Mark::default())
 }
 
 fn open(frames: &mut Frames, tiles: u32, levels: u32) -> u64 {
-    frames.open(spec(tiles, levels), |_| Mark::default()).expect("sound")
+    opened(frames, spec(tiles, levels)).expect("room")
 }
 
 fn complete(frames: &mut Frames, worker: &str, lease: &v1::Lease, bytes: usize) -> Result<bool, Refusal> {
@@ -246,7 +252,7 @@ fn complete(frames: &mut Frames, worker: &str, lease: &v1::Lease, bytes: usize) 
         tiles: (lease.tile_from..lease.tile_to).map(tile).collect(),
         ..Default::default()
     };
-    frames.complete(request, Duration::ZERO, |_| Mark::default())
+    frames.complete(request, Duration::ZERO, |_, _| Mark::default())
 }
 
 #[test]
@@ -287,7 +293,7 @@ fn older_frames_come_first_and_a_worker_that_declined_gets_the_next() {
     assert_eq!(lease(&mut frames, "a", 0).expect("work").frame, new);
     assert_eq!(lease(&mut frames, "b", 0).map(|l| (l.frame, l.tile_from)), Some((old, 0)));
     let mut declined = None;
-    while let News::Tell(event) = frames.news(old, |_| Mark::default()) {
+    while let News::Tell(event) = frames.news(old, |_, _| Mark::default()) {
         if let Some(Event::Declined(d)) = event.event {
             declined = Some(d);
         }
@@ -296,7 +302,7 @@ fn older_frames_come_first_and_a_worker_that_declined_gets_the_next() {
     assert_eq!((declined.worker.as_str(), declined.reason.len()), ("a", 1024));
 
     frames.close(old);
-    assert!(matches!(frames.describe(old), Err(Refusal::NoFrame(_))));
+    assert!(matches!(frames.frame(&Tenant::default(), old).map(Frame::job), Err(Refusal::NoFrame(_))));
     assert_eq!(frames.renew("b", Duration::ZERO), []);
 }
 
@@ -304,7 +310,7 @@ fn older_frames_come_first_and_a_worker_that_declined_gets_the_next() {
 fn pixels_wait_for_an_owner_that_does_not_read() {
     let mut frames = Frames::new(1);
     let big = v1::FrameSpec { width: 256 * 64, height: 256, tile_size: 256, ..spec(1, 0) };
-    let frame = frames.open(big, |_| Mark::default()).expect("sound");
+    let frame = opened(&mut frames, big).expect("room");
     let bytes = 256 * 256 * 64;
     let mut done = 0;
     while let Some(work) = lease(&mut frames, "a", 0) {
@@ -315,7 +321,7 @@ fn pixels_wait_for_an_owner_that_does_not_read() {
     assert_eq!(done, UNDELIVERED_MAX / bytes);
     frames.take_changes();
     while !frames.take_changes().work {
-        assert!(matches!(frames.news(frame, |_| Mark::default()), News::Tell(_)));
+        assert!(matches!(frames.news(frame, |_, _| Mark::default()), News::Tell(_)));
     }
     assert!(lease(&mut frames, "a", 0).is_some());
 }
@@ -342,7 +348,7 @@ fn what_a_worker_says_wrong_is_named_and_its_lease_stays() {
         tiles: (work.tile_from..work.tile_to).map(|tile| v1::FrameTile { tile, pixels: vec![0; 48].into() }).collect(),
         counts: vec![v1::Count { name: name.into(), value }],
     };
-    let mut say = |request| frames.complete(request, Duration::ZERO, |_| Mark::default());
+    let mut say = |request| frames.complete(request, Duration::ZERO, |_, _| Mark::default());
     named(say(saying(u64::MAX, "rays", 1.0)), "gathered");
     named(say(saying(0, "rays", f64::NAN)), "counts.value");
     named(say(saying(0, &"x".repeat(65), 1.0)), "counts.name");
@@ -356,14 +362,65 @@ fn lists_are_bounded() {
     for _ in 0..FRAMES_MAX {
         open(&mut frames, 4000, 0);
     }
-    assert!(matches!(frames.open(spec(1, 0), |_| Mark::default()), Err(Refusal::Full { what: "frames", .. })));
+    assert!(matches!(opened(&mut frames, spec(1, 0)), Err(Refusal::Full { what: "frames", .. })));
     for worker in 0..WORKERS_MAX {
         lease(&mut frames, &worker.to_string(), 0);
     }
-    assert!(matches!(frames.lease("one more", Duration::ZERO), Err(Refusal::Full { what: "workers", .. })));
+    let mut asks = |worker| frames.lease(&Tenant::default(), worker, Duration::ZERO);
+    assert!(matches!(asks("one more"), Err(Refusal::Full { what: "workers", .. })));
     for _ in 1..LEASES_MAX {
-        assert!(lease(&mut frames, "0", 0).is_some());
+        assert!(matches!(asks("0"), Ok(Some(_))));
     }
-    assert!(matches!(frames.lease("0", Duration::ZERO), Err(Refusal::Full { .. })));
-    assert!(matches!(frames.lease(&"x".repeat(65), Duration::ZERO), Err(Refusal::Field { .. })));
+    assert!(matches!(asks("0"), Err(Refusal::Full { .. })));
+}
+
+#[test]
+fn a_tenants_workers_and_others_do_not_meet() {
+    let mut frames = Frames::new(1);
+    let frame = open(&mut frames, 4, 0);
+    let other = Tenant::from("other");
+    assert_eq!(frames.lease(&other, "other/a", Duration::ZERO).expect("room"), None);
+    assert!(matches!(frames.frame(&other, frame).map(Frame::job), Err(Refusal::NoFrame(_))));
+    assert!(lease(&mut frames, "a", 0).is_some());
+}
+
+#[test]
+fn a_step_reads_what_lower_steps_gathered_and_a_filled_draft_is_told_once() {
+    let mut frames = Frames::new(1);
+    let job = Job::check(spec(1, 1)).expect("sound");
+    let base = Mark { position: 7, sum: cache_core::set::Sum { records: 7, digest: cache_core::id::Digest(70) } };
+    let draft = Namespace([9; 32]);
+    // Each step gathers one record, of a digest that is the step.
+    let state = |step: u32| Mark {
+        position: 100,
+        sum: cache_core::set::Sum { records: step.into(), digest: cache_core::id::Digest(step.into()) },
+    };
+    let mark = |of: &Namespace, step: u32| {
+        assert_eq!(*of, draft);
+        state(step)
+    };
+    let namespace = job.namespace;
+    let frame = frames.open(job, Origin { tenant: Tenant::default(), base, draft }, mark).expect("room");
+    let (mut filled, mut steps) = (vec![], 0);
+    while let Some(work) = lease(&mut frames, "a", 0) {
+        let step = work.step.expect("a step");
+        assert_eq!(convert::digest(&step.sealed_digest).expect("16 bytes"), state(step.index).sum.digest);
+        assert_eq!(step.sealed_position, 100);
+        let pixels = v1::FrameTile { tile: 0, pixels: vec![0; 4 * 12].into() };
+        let tiles = if step.level == 0 { vec![pixels] } else { vec![] };
+        let (lease, frame) = (work.id, work.frame);
+        let request = v1::CompleteRequest { worker: "a".into(), lease, frame, tiles, ..Default::default() };
+        assert!(frames.complete(request, Duration::ZERO, mark).expect("sound"));
+        filled.extend(frames.take_changes().filled.map(|filled| (filled, step.index)));
+        steps = step.index;
+    }
+    assert_eq!(filled, [((draft, namespace), steps - 1)]);
+    let mut told = vec![];
+    while let News::Tell(event) = frames.news(frame, mark) {
+        told.extend(event.event);
+    }
+    assert!(matches!(&told[0], Event::Opened(opened) if opened.base_records == 7 && opened.base[0] == 70));
+    let Some(Event::Done(done)) = told.last() else { panic!("{told:?}") };
+    assert_eq!(done.records, 7 + u64::from(steps));
+    assert_eq!(convert::digest(&done.digest).expect("16 bytes").0, 70 + u128::from(steps));
 }

@@ -3,9 +3,10 @@
 //! In the order of the flow, one sentence each:
 //!
 //! - [`refusal`]: what a peer can be refused for; every other room returns these.
+//! - [`access`]: who calls.
 //! - [`journal`]: the door to durable storage: an insert is acknowledged only after it took the batch.
 //! - [`replica`]: the record sets of all namespaces, as logs that can be read by position; no I/O.
-//! - [`store`]: the replica shared between tasks, with its journal and the bell that tells of growth.
+//! - [`store`]: the replica shared between tasks, and the one task that writes: journal, memory, acknowledgement.
 //! - [`query`]: sealed levels kept ready to answer clients that hold no replica.
 //! - [`spec`]: what a frame asks for, checked once.
 //! - [`round`]: the tiles of one step: pending, leased or done; no I/O.
@@ -19,6 +20,8 @@
 //! - [`cli`]: the arguments of `cache-server`, which `ambience serve` re-uses.
 
 pub mod refusal;
+
+pub mod access;
 
 pub mod journal;
 pub mod query;

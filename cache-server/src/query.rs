@@ -56,12 +56,13 @@ impl Queries {
         Self { store, kept: Mutex::default(), turns: Semaphore::new(AT_ONCE) }
     }
 
-    /// Interpolates at every point of a request: [`ANSWER_BYTES`] each. The work is done off the async threads.
+    /// Interpolates at every point of a tenant's request: [`ANSWER_BYTES`] each. The work is done off the async threads.
     ///
     /// # Errors
-    /// What is unsound about the request.
-    pub async fn answer(self: &Arc<Self>, request: &QueryRequest) -> Result<Vec<u8>, Refusal> {
+    /// What is unsound about the request, or [`Refusal::Foreign`].
+    pub async fn answer(self: &Arc<Self>, tenant: &str, request: &QueryRequest) -> Result<Vec<u8>, Refusal> {
         let (key, points) = parse(request)?;
+        self.store.replica().belongs(&key.namespace, tenant)?;
         let _turn = self.turns.acquire().await.map_err(|_| Refusal::Closing)?;
         let queries = self.clone();
         let work = tokio::task::spawn_blocking(move || pack(&queries.sealed(key), &points));

@@ -1,5 +1,6 @@
 //! What a peer can be refused for, and the one function that puts it on the wire.
 
+use cache_core::Namespace;
 use cache_proto::convert::Malformed;
 use tonic::Status;
 
@@ -49,6 +50,12 @@ pub enum Refusal {
         /// Length of the namespace's log.
         end: u64,
     },
+    /// The draft's records belong to its namespace now, and no frame fills it any more. Nothing will come: stop asking.
+    #[error("the draft is published; its records are in its namespace")]
+    Published,
+    /// The namespace belongs to another token. Use that.
+    #[error("namespace {}... belongs to another token", short(.0))]
+    Foreign(Namespace),
     /// The frame is over, was cancelled, or never was.
     #[error("there is no frame {0}")]
     NoFrame(u64),
@@ -70,6 +77,11 @@ impl Refusal {
     }
 }
 
+/// Enough of a namespace to tell it from others.
+fn short(namespace: &Namespace) -> String {
+    namespace.0[..4].iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
 /// The status a refusal has on the wire.
 impl From<Refusal> for Status {
     fn from(refusal: Refusal) -> Self {
@@ -80,7 +92,8 @@ impl From<Refusal> for Status {
             Refusal::Full { .. } => Status::resource_exhausted(message),
             Refusal::Version { .. } => Status::failed_precondition(message),
             Refusal::PastEnd { .. } => Status::out_of_range(message),
-            Refusal::NoFrame(_) => Status::not_found(message),
+            Refusal::NoFrame(_) | Refusal::Published => Status::not_found(message),
+            Refusal::Foreign(_) => Status::permission_denied(message),
             Refusal::Closing | Refusal::Journal(_) => Status::unavailable(message),
             Refusal::Internal(_) => Status::internal(message),
         }

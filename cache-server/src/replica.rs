@@ -1,18 +1,27 @@
 //! The record sets of all namespaces, as logs that can be read by position. No I/O, no locks: [`crate::store`] shares it.
+//!
+//! It is what a list of entries amounts to, in whatever order and however often they come: every server, journal and
+//! archive is read through [`Replica::apply`].
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, VecDeque};
+use std::ops::Range;
 
 use cache_core::id::Digest;
-use cache_core::{Irradiance, Namespace, RecordSet, Tag, set};
-use cache_proto::convert::{self, BATCH_RECORDS_MAX};
+use cache_core::set::{Inserted, Sum};
+use cache_core::{Irradiance, Namespace, RecordSet, Tag};
+use cache_proto::convert::{self, BATCH_RECORDS_MAX, Checked};
 use cache_proto::v1;
+use prost::Message as _;
 
 use crate::refusal::Refusal;
+
+/// Published drafts remembered, so that what comes for them late still finds its namespace.
+const PUBLISHED_MAX: usize = 4096;
 
 /// Bounds of what one server keeps.
 #[derive(Clone, Copy, Debug)]
 pub struct Limits {
-    /// Most namespaces.
+    /// Most namespaces, drafts included.
     pub namespaces: usize,
     /// Most records in all logs together; one takes about 170 bytes of memory.
     pub records: usize,
@@ -38,17 +47,35 @@ pub struct Added {
 pub struct Mark {
     /// Length of the log.
     pub position: u64,
-    /// Digest of the records up to there.
-    pub digest: Digest,
-    /// Distinct records up to there.
-    pub records: u64,
+    /// The records up to there; of a draft, those of the steps asked for.
+    pub sum: Sum,
+}
+
+/// One namespace.
+#[derive(Debug, Default)]
+struct Kept {
+    set: RecordSet<Irradiance>,
+    label: Option<v1::Label>,
+    draft_of: Option<Namespace>,
+    /// Frames that fill this draft now.
+    holds: usize,
+}
+
+/// A draft that was published: whose it is now, and which part of that log it is.
+#[derive(Debug)]
+struct Published {
+    namespace: Namespace,
+    range: Range<usize>,
 }
 
 /// All records this server holds.
 #[derive(Debug)]
 pub struct Replica {
     limits: Limits,
-    sets: HashMap<Namespace, RecordSet<Irradiance>>,
+    kept: BTreeMap<Namespace, Kept>,
+    published: BTreeMap<Namespace, Published>,
+    /// Oldest first.
+    publications: VecDeque<Namespace>,
     /// Sum of the logs' lengths.
     held: usize,
 }
@@ -56,49 +83,153 @@ pub struct Replica {
 impl Replica {
     /// An empty replica.
     pub fn new(limits: Limits) -> Self {
-        Self { limits, sets: HashMap::new(), held: 0 }
+        let (kept, published, publications) = Default::default();
+        Self { limits, kept, published, publications, held: 0 }
     }
 
-    /// Whether there is room for `count` more records of a namespace, should all of them be new.
+    /// Unites with an entry.
+    ///
+    /// # Errors
+    /// [`Refusal::Full`]; nothing of the entry is used then.
+    pub fn apply(&mut self, entry: Checked<Irradiance>) -> Result<Added, Refusal> {
+        match entry {
+            Checked::Batch(namespace, tag, records) => self.insert(namespace, tag, &records),
+            Checked::Label(namespace, draft_of, label) => {
+                self.label(namespace, draft_of, label).map(|()| Added::default())
+            }
+            Checked::Publication { draft, namespace } => self.publish(draft, namespace),
+        }
+    }
+
+    /// Whether there is room for `count` more records of a namespace, should all of them be new. Makes room by giving up
+    /// drafts no frame fills: they are what interrupted frames left.
     ///
     /// # Errors
     /// [`Refusal::Full`].
-    pub fn admit(&self, namespace: &Namespace, count: usize) -> Result<(), Refusal> {
+    pub fn admit(&mut self, namespace: &Namespace, count: usize) -> Result<(), Refusal> {
+        if self.room(namespace, count).is_err() {
+            let idle = |n: &Namespace, kept: &Kept| kept.draft_of.is_some() && kept.holds == 0 && n != namespace;
+            let held = &mut self.held;
+            self.kept.retain(|n, kept| {
+                let idle = idle(n, kept);
+                if idle {
+                    *held -= kept.set.position();
+                }
+                !idle
+            });
+        }
+        self.room(namespace, count)
+    }
+
+    fn room(&self, namespace: &Namespace, count: usize) -> Result<(), Refusal> {
         if self.held + count > self.limits.records {
             return Err(Refusal::Full { what: "records", most: self.limits.records });
         }
-        if self.sets.len() >= self.limits.namespaces && !self.sets.contains_key(namespace) {
+        if self.kept.len() >= self.limits.namespaces && !self.kept.contains_key(namespace) {
             return Err(Refusal::Full { what: "namespaces", most: self.limits.namespaces });
         }
         Ok(())
     }
 
-    /// Unites with a batch.
-    ///
-    /// # Errors
-    /// [`Refusal::Full`]; nothing of the batch is used then.
-    pub fn insert(&mut self, namespace: Namespace, tag: Tag, records: &[Irradiance]) -> Result<Added, Refusal> {
+    /// Unites with a batch. What is published already goes where it was published to, too.
+    fn insert(&mut self, namespace: Namespace, tag: Tag, records: &[Irradiance]) -> Result<Added, Refusal> {
         if records.is_empty() {
             return Ok(Added { added: 0, position: self.mark(&namespace).position });
         }
+        let published = self.published.get(&namespace).map(|published| published.namespace);
+        if let Some(into) = published {
+            self.admit(&into, 2 * records.len())?;
+            self.unite(into, tag, records);
+            if !self.kept.contains_key(&namespace) {
+                return Ok(Added::default());
+            }
+        }
         self.admit(&namespace, records.len())?;
-        let set = self.sets.entry(namespace).or_default();
+        Ok(self.unite(namespace, tag, records))
+    }
+
+    /// Unites with records there is room for.
+    fn unite(&mut self, namespace: Namespace, tag: Tag, records: &[Irradiance]) -> Added {
+        let set = &mut self.kept.entry(namespace).or_default().set;
         let (before, known) = (set.position(), set.len());
         for record in records {
-            let outcome = set.insert(tag, *record);
-            if outcome == set::Inserted::Replaced {
+            if set.insert(tag, *record) == Inserted::Replaced {
                 tracing::warn!(id = format_args!("{:032x}", record.id.0), "a record came twice with different content");
             }
         }
         self.held += set.position() - before;
-        Ok(Added { added: (set.len() - known) as u64, position: set.position() as u64 })
+        Added { added: (set.len() - known) as u64, position: set.position() as u64 }
+    }
+
+    /// Names a namespace. Of different labels for one, the smaller bytes stay, so that the order does not matter.
+    fn label(&mut self, namespace: Namespace, draft_of: Option<Namespace>, label: v1::Label) -> Result<(), Refusal> {
+        if self.published.contains_key(&namespace) && !self.kept.contains_key(&namespace) {
+            return Ok(());
+        }
+        self.admit(&namespace, 0)?;
+        let kept = self.kept.entry(namespace).or_default();
+        if kept.label.as_ref().is_none_or(|known| label.encode_to_vec() < known.encode_to_vec()) {
+            (kept.label, kept.draft_of) = (Some(label), draft_of);
+        }
+        Ok(())
+    }
+
+    /// The records of a draft belong to a namespace from now on, and so do those that come later.
+    fn publish(&mut self, draft: Namespace, namespace: Namespace) -> Result<Added, Refusal> {
+        let log = self.kept.get(&draft).map_or(Vec::new(), |kept| kept.set.since(0).to_vec());
+        self.admit(&namespace, log.len())?;
+        let set = &mut self.kept.entry(namespace).or_default().set;
+        let (start, known) = (set.position(), set.len());
+        for (tag, record) in log {
+            set.insert(tag, record);
+        }
+        let (end, added) = (set.position(), (set.len() - known) as u64);
+        self.held += end - start;
+        if self.published.insert(draft, Published { namespace, range: start..end }).is_none() {
+            self.publications.push_back(draft);
+            if self.publications.len() > PUBLISHED_MAX {
+                self.publications.pop_front().map(|oldest| self.published.remove(&oldest));
+            }
+        }
+        self.retire(&draft);
+        Ok(Added { added, position: end as u64 })
+    }
+
+    /// A frame begins to fill a draft. One that was published comes back as it was.
+    pub fn hold(&mut self, draft: Namespace) {
+        let known = self.kept.contains_key(&draft);
+        let again = self.published.get(&draft).filter(|_| !known).and_then(|published| {
+            let log = self.kept.get(&published.namespace)?.set.since(published.range.start);
+            Some(log[..published.range.len()].to_vec())
+        });
+        let kept = self.kept.entry(draft).or_default();
+        kept.holds += 1;
+        for (tag, record) in again.unwrap_or_default() {
+            kept.set.insert(tag, record);
+            self.held += 1;
+        }
+    }
+
+    /// A frame has ended: a draft no other frame fills is forgotten if it was published.
+    pub fn release(&mut self, draft: &Namespace) {
+        if let Some(kept) = self.kept.get_mut(draft) {
+            kept.holds = kept.holds.saturating_sub(1);
+        }
+        self.retire(draft);
+    }
+
+    fn retire(&mut self, draft: &Namespace) {
+        let idle = self.kept.get(draft).is_some_and(|kept| kept.holds == 0);
+        if idle && self.published.contains_key(draft) {
+            self.held -= self.kept.remove(draft).map_or(0, |kept| kept.set.position());
+        }
     }
 
     /// What stands at a position of the log: records of one tag, as many as fit one batch, and how many those are.
     /// `None` at the end.
     ///
     /// # Errors
-    /// [`Refusal::PastEnd`].
+    /// [`Refusal::PastEnd`], [`Refusal::Published`].
     pub fn read(&self, namespace: &Namespace, position: u64) -> Result<Option<(u64, v1::RecordBatch)>, Refusal> {
         let rest = self.since(namespace, position)?;
         let Some(&(tag, _)) = rest.first() else { return Ok(None) };
@@ -107,45 +238,113 @@ impl Replica {
         Ok(Some((count as u64, convert::pack(namespace, tag, run))))
     }
 
-    /// The log of a namespace from a position on: in order of arrival.
+    /// The log of a namespace from a position on, in order of arrival.
     ///
     /// # Errors
-    /// [`Refusal::PastEnd`].
+    /// [`Refusal::PastEnd`], or [`Refusal::Published`] for a draft that is no more.
     pub fn since(&self, namespace: &Namespace, position: u64) -> Result<&[(Tag, Irradiance)], Refusal> {
-        let set = self.sets.get(namespace);
-        let end = set.map_or(0, RecordSet::position) as u64;
+        let Some(kept) = self.kept.get(namespace) else {
+            return match position {
+                _ if self.published.contains_key(namespace) => Err(Refusal::Published),
+                0 => Ok(&[]),
+                asked => Err(Refusal::PastEnd { asked, end: 0 }),
+            };
+        };
+        let end = kept.set.position() as u64;
         if position > end {
             return Err(Refusal::PastEnd { asked: position, end });
         }
-        Ok(set.map_or(&[], |set| set.since(position as usize)))
+        Ok(kept.set.since(position as usize))
     }
 
     /// Where a namespace's log stands now.
     pub fn mark(&self, namespace: &Namespace) -> Mark {
-        self.sets.get(namespace).map_or(Mark::default(), |set| Mark {
-            position: set.position() as u64,
-            digest: set.digest(),
-            records: set.len() as u64,
-        })
+        let mark = |set: &RecordSet<_>| Mark { position: set.position() as u64, sum: set.sum() };
+        self.set(namespace).map(mark).unwrap_or_default()
+    }
+
+    /// Where a draft's log stands now, and what the steps before `step` gathered.
+    pub fn mark_before(&self, draft: &Namespace, step: u32) -> Mark {
+        let mark = |set: &RecordSet<_>| Mark { position: set.position() as u64, sum: set.before(step) };
+        self.set(draft).map(mark).unwrap_or_default()
+    }
+
+    /// Where a namespace's log stood when its records had this digest.
+    pub fn find(&self, namespace: &Namespace, digest: Digest) -> Option<Mark> {
+        if digest == Digest::default() {
+            return Some(Mark::default());
+        }
+        let set = self.set(namespace)?;
+        let position = set.find(digest)?;
+        Some(Mark { position: position as u64, sum: set.prefix(position) })
+    }
+
+    /// Where a subscription begins that holds `position` records of `digest`: there, or at 0 if this log has others.
+    pub fn resume(&self, namespace: &Namespace, position: u64, digest: Digest) -> u64 {
+        let same = |set: &RecordSet<_>| {
+            usize::try_from(position).is_ok_and(|at| at <= set.position() && set.prefix(at).digest == digest)
+        };
+        if self.set(namespace).is_some_and(same) { position } else { 0 }
     }
 
     /// The records of one level, replaced ones left out.
     pub fn level(&self, namespace: &Namespace, level: u32) -> Vec<Irradiance> {
-        self.sets.get(namespace).map_or(Vec::new(), |set| set.level(level).copied().collect())
+        self.set(namespace).map_or(Vec::new(), |set| set.level(level).copied().collect())
     }
 
-    /// What it holds, namespaces in byte order.
-    pub fn info(&self) -> Vec<v1::NamespaceInfo> {
-        let mut all: Vec<_> = self.sets.iter().collect();
-        all.sort_by_key(|(namespace, _)| **namespace);
-        let info = |(namespace, set): (&Namespace, &RecordSet<Irradiance>)| v1::NamespaceInfo {
-            namespace: namespace.0.to_vec().into(),
-            records: set.len() as u64,
-            digest: convert::digest_bytes(set.digest()),
-            conflicts: set.conflicts(),
-            label: None,
+    /// The records of a namespace.
+    pub fn set(&self, namespace: &Namespace) -> Option<&RecordSet<Irradiance>> {
+        self.kept.get(namespace).map(|kept| &kept.set)
+    }
+
+    /// Whether anything is known of a namespace.
+    pub fn is_known(&self, namespace: &Namespace) -> bool {
+        self.kept.contains_key(namespace) || self.published.contains_key(namespace)
+    }
+
+    /// What a namespace is.
+    pub fn label_of(&self, namespace: &Namespace) -> Option<&v1::Label> {
+        self.kept.get(namespace)?.label.as_ref()
+    }
+
+    /// Refuses whom a namespace does not belong to. One that is not there yet belongs to who comes first; a published
+    /// draft to whom its namespace belongs.
+    ///
+    /// # Errors
+    /// [`Refusal::Foreign`].
+    pub fn belongs(&self, namespace: &Namespace, tenant: &str) -> Result<(), Refusal> {
+        let place = match self.kept.get(namespace) {
+            Some(_) => namespace,
+            None => self.published.get(namespace).map_or(namespace, |published| &published.namespace),
         };
-        all.into_iter().map(info).collect()
+        let owner = |kept: &Kept| kept.label.as_ref().map_or(String::new(), |label| label.owner.clone());
+        match self.kept.get(place).map(owner) {
+            Some(owner) if owner != tenant => Err(Refusal::Foreign(*namespace)),
+            _ => Ok(()),
+        }
+    }
+
+    /// The namespaces held, in byte order.
+    pub fn namespaces(&self) -> impl Iterator<Item = &Namespace> {
+        self.kept.keys()
+    }
+
+    /// Records in all logs, and namespaces.
+    pub fn census(&self) -> (u64, u64) {
+        (self.held as u64, self.kept.len() as u64)
+    }
+
+    /// What it holds for a tenant, namespaces in byte order.
+    pub fn info(&self, tenant: &str) -> Vec<v1::NamespaceInfo> {
+        let own = self.kept.iter().filter(|(namespace, _)| self.belongs(namespace, tenant).is_ok());
+        let info = |(namespace, kept): (&Namespace, &Kept)| v1::NamespaceInfo {
+            namespace: namespace.0.to_vec().into(),
+            records: kept.set.len() as u64,
+            digest: convert::digest_bytes(kept.set.digest()),
+            conflicts: kept.set.conflicts(),
+            label: kept.label.clone(),
+        };
+        own.map(info).collect()
     }
 }
 
@@ -195,14 +394,14 @@ mod tests {
                 let before = near.mark(&NAMESPACE);
                 let added = near.insert(NAMESPACE, Tag::level(*level), &records).expect("room");
                 let after = near.mark(&NAMESPACE);
-                prop_assert_eq!((added.added, added.position), (after.records - before.records, after.position));
+                let new = after.sum.records - before.sum.records;
+                prop_assert_eq!((added.added, added.position), (new, after.position));
                 if at % 3 == 0 {
                     follow(&near, &mut position, &mut far);
                 }
             }
             follow(&near, &mut position, &mut far);
-            let held = |r: &Replica| (r.mark(&NAMESPACE).records, r.mark(&NAMESPACE).digest);
-            prop_assert_eq!(held(&near), held(&far));
+            prop_assert_eq!(near.mark(&NAMESPACE).sum, far.mark(&NAMESPACE).sum);
             for level in 1..3 {
                 prop_assert_eq!(near.level(&NAMESPACE, level), far.level(&NAMESPACE, level));
             }
@@ -230,9 +429,109 @@ mod tests {
         replica.insert(NAMESPACE, Tag::level(1), &[record(1, 0.0), record(2, 0.0)]).expect("room");
         let full = replica.insert(NAMESPACE, Tag::level(1), &[record(3, 0.0), record(4, 0.0)]);
         assert!(full.expect_err("full").to_string().contains("at most 3"));
-        assert_eq!(replica.mark(&NAMESPACE).records, 2);
+        assert_eq!(replica.mark(&NAMESPACE).sum.records, 2);
         let full = replica.insert(Namespace([8; 32]), Tag::level(1), &[record(3, 0.0)]);
         assert!(full.expect_err("full").to_string().contains("namespaces"));
         assert_eq!(replica.insert(Namespace([9; 32]), Tag::level(1), &[]).expect("nothing"), Added::default());
+    }
+
+    const DRAFT: Namespace = Namespace([9; 32]);
+
+    fn label(namespace: Namespace, draft_of: Option<Namespace>, owner: &str) -> Checked<Irradiance> {
+        let label = v1::Label { owner: owner.into(), ..Default::default() };
+        Checked::Label(namespace, draft_of, label)
+    }
+
+    fn gathered(step: u32, ids: Range<u32>) -> Checked<Irradiance> {
+        Checked::Batch(DRAFT, Tag { level: 1, step }, ids.map(|id| record(id, 0.0)).collect())
+    }
+
+    proptest! {
+        /// Whatever order entries come in, and however often, the namespace ends with the same records.
+        #[test]
+        fn entries_amount_to_the_same_in_any_order(order in Just((0..6usize).collect::<Vec<_>>()).prop_shuffle(), again in 0..6usize) {
+            let entries = [
+                label(NAMESPACE, None, "b"),
+                label(NAMESPACE, None, "a"),
+                label(DRAFT, Some(NAMESPACE), "a"),
+                gathered(0, 0..5),
+                gathered(1, 5..7),
+                Checked::Publication { draft: DRAFT, namespace: NAMESPACE },
+            ];
+            let mut replica = Replica::new(Limits::default());
+            for at in order.into_iter().chain([again]) {
+                replica.apply(entries[at].clone()).expect("room");
+            }
+            prop_assert_eq!(replica.mark(&NAMESPACE).sum.records, 7);
+            prop_assert_eq!(replica.mark(&NAMESPACE).sum.digest, Digest((0..7).sum()));
+            prop_assert_eq!(replica.label_of(&NAMESPACE).map(|l| l.owner.as_str()), Some("a"));
+            prop_assert_eq!(replica.info("a").len(), 1);
+            prop_assert!(replica.since(&DRAFT, 0).is_err());
+        }
+    }
+
+    #[test]
+    fn a_published_draft_lives_while_a_frame_holds_it_and_comes_back_as_it_was() {
+        let mut replica = Replica::new(Limits::default());
+        replica.apply(Checked::Batch(NAMESPACE, Tag::level(1), vec![record(50, 0.0)])).expect("room");
+        replica.hold(DRAFT);
+        replica.apply(gathered(0, 0..5)).expect("room");
+        replica.apply(gathered(3, 5..7)).expect("room");
+        let steps = |replica: &Replica| [0, 1, 3, 4].map(|step| replica.mark_before(&DRAFT, step).sum.records);
+        assert_eq!(steps(&replica), [0, 5, 5, 7]);
+        replica.apply(Checked::Publication { draft: DRAFT, namespace: NAMESPACE }).expect("room");
+        assert_eq!((steps(&replica), replica.mark(&NAMESPACE).sum.records), ([0, 5, 5, 7], 8));
+        assert_eq!(replica.census(), (15, 2));
+
+        replica.release(&DRAFT);
+        assert_eq!(replica.census(), (8, 1));
+        assert!(matches!(replica.since(&DRAFT, 3), Err(Refusal::Published)));
+        // A worker that was late.
+        replica.apply(gathered(3, 7..9)).expect("room");
+        assert_eq!((replica.mark(&NAMESPACE).sum.records, replica.census()), (10, (10, 1)));
+
+        replica.hold(DRAFT);
+        assert_eq!(steps(&replica), [0, 5, 5, 7]);
+        replica.release(&DRAFT);
+        assert_eq!(replica.census(), (10, 1));
+    }
+
+    #[test]
+    fn drafts_nobody_fills_make_room() {
+        let mut replica = Replica::new(Limits { namespaces: 2, records: 8 });
+        replica.apply(label(DRAFT, Some(NAMESPACE), "")).expect("room");
+        replica.apply(gathered(0, 0..5)).expect("room");
+        replica.hold(DRAFT);
+        let more = || Checked::Batch(NAMESPACE, Tag::level(1), (10..14).map(|id| record(id, 0.0)).collect());
+        assert!(matches!(replica.apply(more()), Err(Refusal::Full { what: "records", .. })));
+        replica.release(&DRAFT);
+        replica.apply(more()).expect("room");
+        assert_eq!(replica.census(), (4, 1));
+    }
+
+    #[test]
+    fn a_subscriber_resumes_only_where_the_log_is_the_same() {
+        let mut replica = Replica::new(Limits::default());
+        let records: Vec<_> = [4, 1, 9].map(|id| record(id, 0.0)).to_vec();
+        replica.insert(NAMESPACE, Tag::level(1), &records).expect("room");
+        let resume = |position, digest| replica.resume(&NAMESPACE, position, Digest(digest));
+        assert_eq!([resume(2, 5), resume(3, 14), resume(2, 13), resume(4, 14)], [2, 3, 0, 0]);
+        assert_eq!(replica.find(&NAMESPACE, Digest(5)).map(|mark| mark.position), Some(2));
+        assert_eq!(replica.find(&NAMESPACE, Digest(13)), None);
+        assert_eq!(replica.find(&DRAFT, Digest(0)), Some(Mark::default()));
+    }
+
+    #[test]
+    fn a_namespace_belongs_to_who_began_it() {
+        let mut replica = Replica::new(Limits::default());
+        assert!(replica.belongs(&NAMESPACE, "b").is_ok());
+        replica.apply(label(NAMESPACE, None, "a")).expect("room");
+        assert!(replica.belongs(&NAMESPACE, "a").is_ok());
+        let refused = replica.belongs(&NAMESPACE, "b").expect_err("foreign").to_string();
+        assert!(refused.contains("07070707"), "{refused}");
+        assert!(replica.belongs(&NAMESPACE, "").is_err());
+        replica.insert(DRAFT, Tag::level(1), &[record(1, 0.0)]).expect("room");
+        assert!(replica.belongs(&DRAFT, "").is_ok() && replica.belongs(&DRAFT, "a").is_err());
+        assert_eq!((replica.info("a").len(), replica.info("b").len(), replica.info("").len()), (1, 0, 1));
     }
 }

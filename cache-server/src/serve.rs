@@ -80,7 +80,9 @@ impl Node {
     /// # Errors
     /// When the journal cannot be read.
     pub fn new(config: Config) -> io::Result<Self> {
-        let store = Arc::new(Store::open(config.limits, config.journal)?);
+        let (store, writer) = Store::open(config.limits, config.journal)?;
+        tokio::spawn(writer.run());
+        let store = Arc::new(store);
         let board = Arc::new(Board::new(store.clone(), Clock::start(), config.first_number));
         Ok(Self { store, board })
     }

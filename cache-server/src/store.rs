@@ -1,72 +1,151 @@
-//! The replica shared between tasks, with its journal and the bell that tells of growth.
+//! The replica shared between tasks, and the one task that writes to it: journal first, then memory, then the
+//! acknowledgement.
 //!
-//! Locks are held for the time of one batch at most and never across an await. Order where both are taken: journal,
-//! replica.
+//! Entries wait in a bounded queue; whatever stands there when the journal is free is made durable together. The
+//! replica's lock is held for the time of one entry at most and never across an await.
 
 use std::io;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
 
 use cache_core::{Irradiance, Namespace};
+use cache_proto::convert::{self, Checked};
 use cache_proto::v1::entry::Entry as Kind;
-use cache_proto::{convert, v1};
+use cache_proto::v1::{Entry, Label, Publication, RecordBatch};
+use tokio::sync::{mpsc, oneshot};
 
 use crate::bell::Bell;
 use crate::journal::Journal;
 use crate::refusal::Refusal;
 use crate::replica::{Added, Limits, Mark, Replica};
 
+/// Most entries that wait to be written; whoever brings more waits. An entry has at most half a megabyte.
+const QUEUE_MAX: usize = 64;
+
+/// Most entries made durable together.
+const GROUP_MAX: usize = 64;
+
 /// Everything the server keeps.
 pub struct Store {
-    journal: Mutex<Box<dyn Journal>>,
-    replica: RwLock<Replica>,
-    grown: Bell,
+    shared: Arc<Shared>,
+    queue: mpsc::Sender<Pending>,
     subscribers: AtomicU64,
 }
 
-impl Store {
-    /// A store that begins with what the journal kept.
+#[derive(Debug)]
+struct Shared {
+    replica: RwLock<Replica>,
+    grown: Bell,
+}
+
+/// An entry on its way, and whom to tell.
+struct Pending {
+    entry: Entry,
+    checked: Checked<Irradiance>,
+    kept: oneshot::Sender<Result<Added, Refusal>>,
+}
+
+/// An entry that waits to be kept.
+pub struct Keeping(oneshot::Receiver<Result<Added, Refusal>>);
+
+impl Keeping {
+    /// Waits until it is durable and can be read by others. It then may be acknowledged.
     ///
     /// # Errors
-    /// When the journal cannot be read, holds an unsound batch, or more than the limits allow.
-    pub fn open(limits: Limits, mut journal: Box<dyn Journal>) -> io::Result<Self> {
+    /// [`Refusal::Full`] or [`Refusal::Journal`]; nothing of the entry is used then. [`Refusal::Closing`].
+    pub async fn kept(self) -> Result<Added, Refusal> {
+        self.0.await.unwrap_or(Err(Refusal::Closing))
+    }
+}
+
+impl Store {
+    /// A store that begins with what the journal kept, and its writer, to be run for as long as the store lives.
+    ///
+    /// # Errors
+    /// When the journal cannot be read, holds an unsound entry, or more than the limits allow.
+    pub fn open(limits: Limits, mut journal: Box<dyn Journal>) -> io::Result<(Self, Writer)> {
         let mut replica = Replica::new(limits);
         journal.replay(&mut |entry| {
-            let Some(Kind::Batch(batch)) = entry.entry else { return Ok(()) };
-            let (namespace, tag, records) = convert::unpack(&batch).map_err(io::Error::other)?;
-            replica.insert(namespace, tag, &records).map(drop).map_err(io::Error::other)
+            let checked = convert::entry(&entry).map_err(io::Error::other)?;
+            replica.apply(checked).map(drop).map_err(io::Error::other)
         })?;
-        Ok(Self {
-            journal: Mutex::new(journal),
-            replica: RwLock::new(replica),
-            grown: Bell::default(),
-            subscribers: AtomicU64::new(0),
-        })
+        let shared = Arc::new(Shared { replica: RwLock::new(replica), grown: Bell::default() });
+        let (queue, waiting) = mpsc::channel(QUEUE_MAX);
+        let writer = Writer { journal: Some(journal), waiting, shared: shared.clone() };
+        Ok((Self { shared, queue, subscribers: AtomicU64::new(0) }, writer))
     }
 
-    /// Checks, keeps and shows one batch. When it returns the batch may be acknowledged.
+    /// Checks a batch a tenant sent and queues it; waits while the queue is full. The first batch of a namespace makes it
+    /// the tenant's.
     ///
     /// # Errors
-    /// What is unsound about the batch, [`Refusal::Full`] or [`Refusal::Journal`]; nothing of it is used then.
-    pub fn insert(&self, batch: &v1::RecordBatch) -> Result<Added, Refusal> {
-        let (namespace, tag, records) = convert::unpack::<Irradiance>(batch)?;
-        // The journal's lock spans both steps: the journal has the order of the log, and the limit checked is the
-        // limit met.
-        let mut journal = lock(&self.journal);
-        self.replica().admit(&namespace, records.len())?;
-        journal.append(&[v1::Entry { entry: Some(Kind::Batch(batch.clone())) }])?;
-        let added = {
-            let mut replica = self.replica.write().unwrap_or_else(PoisonError::into_inner);
-            replica.insert(namespace, tag, &records)?
-        };
-        drop(journal);
-        self.grown.ring();
-        Ok(added)
+    /// What is unsound about the batch, or [`Refusal::Foreign`].
+    pub async fn insert(&self, tenant: &str, batch: RecordBatch) -> Result<Keeping, Refusal> {
+        let entry = Entry { entry: Some(Kind::Batch(batch)) };
+        let checked = convert::entry(&entry)?;
+        if let Checked::Batch(namespace, ..) = &checked {
+            self.claim(tenant, namespace).await?;
+        }
+        self.queue(entry, checked).await
     }
 
-    /// The replica, to read from: for the time of one batch, not across an await.
+    /// Makes a namespace a tenant's, unless it belongs to somebody. Nobody's namespaces need no label for that.
+    async fn claim(&self, tenant: &str, namespace: &Namespace) -> Result<(), Refusal> {
+        self.replica().belongs(namespace, tenant)?;
+        if tenant.is_empty() || self.replica().is_known(namespace) {
+            return Ok(());
+        }
+        let label = Label { namespace: namespace.0.to_vec().into(), owner: tenant.into(), ..Default::default() };
+        self.label(label).await
+    }
+
+    /// Says what a namespace is, unless that is known.
+    ///
+    /// # Errors
+    /// As [`Keeping::kept`].
+    pub async fn label(&self, label: Label) -> Result<(), Refusal> {
+        let namespace = convert::namespace(&label.namespace)?;
+        if self.replica().label_of(&namespace).is_some() {
+            return Ok(());
+        }
+        self.keep(Kind::Label(label)).await.map(drop)
+    }
+
+    /// A draft's records belong to a namespace from now on.
+    ///
+    /// # Errors
+    /// As [`Keeping::kept`].
+    pub async fn publish(&self, draft: Namespace, namespace: Namespace) -> Result<(), Refusal> {
+        let (draft, namespace) = (draft.0.to_vec().into(), namespace.0.to_vec().into());
+        self.keep(Kind::Publication(Publication { draft, namespace })).await.map(drop)
+    }
+
+    async fn keep(&self, entry: Kind) -> Result<Added, Refusal> {
+        let entry = Entry { entry: Some(entry) };
+        let checked = convert::entry(&entry)?;
+        self.queue(entry, checked).await?.kept().await
+    }
+
+    async fn queue(&self, entry: Entry, checked: Checked<Irradiance>) -> Result<Keeping, Refusal> {
+        let (kept, keeping) = oneshot::channel();
+        let pending = Pending { entry, checked, kept };
+        self.queue.send(pending).await.map_err(|_| Refusal::Closing)?;
+        Ok(Keeping(keeping))
+    }
+
+    /// The replica, to read from: for a short time, not across an await.
     pub fn replica(&self) -> RwLockReadGuard<'_, Replica> {
-        self.replica.read().unwrap_or_else(PoisonError::into_inner)
+        self.shared.replica.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A frame begins to fill a draft.
+    pub fn hold(&self, draft: Namespace) {
+        self.shared.write(|replica| replica.hold(draft));
+    }
+
+    /// A frame that filled a draft has ended.
+    pub fn release(&self, draft: &Namespace) {
+        self.shared.write(|replica| replica.release(draft));
     }
 
     /// Where a namespace's log stands now.
@@ -74,9 +153,9 @@ impl Store {
         self.replica().mark(namespace)
     }
 
-    /// Rung after each insert.
+    /// Rung after each entry.
     pub fn grown(&self) -> &Bell {
-        &self.grown
+        &self.shared.grown
     }
 
     /// How many subscriptions are open.
@@ -88,6 +167,82 @@ impl Store {
     pub fn count_subscriber(self: &Arc<Self>) -> Counted {
         self.subscribers.fetch_add(1, Ordering::Relaxed);
         Counted(self.clone())
+    }
+}
+
+impl Shared {
+    fn write<T>(&self, change: impl FnOnce(&mut Replica) -> T) -> T {
+        change(&mut self.replica.write().unwrap_or_else(PoisonError::into_inner))
+    }
+}
+
+/// The only task that changes what the store keeps.
+pub struct Writer {
+    /// Away while it works on another thread.
+    journal: Option<Box<dyn Journal>>,
+    waiting: mpsc::Receiver<Pending>,
+    shared: Arc<Shared>,
+}
+
+impl Writer {
+    /// Writes until the store is dropped.
+    pub async fn run(mut self) {
+        let mut group = Vec::new();
+        while self.waiting.recv_many(&mut group, GROUP_MAX).await > 0 {
+            self.write(std::mem::take(&mut group)).await;
+        }
+    }
+
+    /// Makes a group durable, then shows it.
+    async fn write(&mut self, group: Vec<Pending>) {
+        let group = self.admitted(group);
+        let entries: Vec<Entry> = group.iter().map(|pending| pending.entry.clone()).collect();
+        let appended = self.append(entries).await;
+        for pending in group {
+            let kept = match &appended {
+                Ok(()) => self.shared.write(|replica| replica.apply(pending.checked)),
+                Err(error) => Err(Refusal::Journal(io::Error::new(error.kind(), error.to_string()))),
+            };
+            self.shared.grown.ring();
+            // Who does not wait for the answer any more will ask again.
+            drop(pending.kept.send(kept));
+        }
+    }
+
+    /// Those there is room for, should all of their records be new.
+    fn admitted(&self, group: Vec<Pending>) -> Vec<Pending> {
+        let (mut admitted, mut count) = (Vec::with_capacity(group.len()), 0);
+        for pending in group {
+            let room = match &pending.checked {
+                Checked::Batch(namespace, _, records) => {
+                    count += records.len();
+                    self.shared.write(|replica| replica.admit(namespace, count))
+                }
+                _ => Ok(()),
+            };
+            match room {
+                Ok(()) => admitted.push(pending),
+                Err(refusal) => drop(pending.kept.send(Err(refusal))),
+            }
+        }
+        admitted
+    }
+
+    async fn append(&mut self, entries: Vec<Entry>) -> io::Result<()> {
+        let lost = || io::Error::other("it is gone; see the log");
+        let mut journal = self.journal.take().ok_or_else(lost)?;
+        if entries.is_empty() || !journal.waits() {
+            let appended = if entries.is_empty() { Ok(()) } else { journal.append(&entries) };
+            self.journal = Some(journal);
+            return appended;
+        }
+        let work = tokio::task::spawn_blocking(move || {
+            let appended = journal.append(&entries);
+            (journal, appended)
+        });
+        let (journal, appended) = work.await.map_err(|panic| io::Error::other(panic.to_string()))?;
+        self.journal = Some(journal);
+        appended
     }
 }
 

@@ -106,6 +106,18 @@ fn subscribe(position: u64) -> v1::SubscribeRequest {
     v1::SubscribeRequest { namespace: NAMESPACE.0.to_vec().into(), position, digest: Default::default() }
 }
 
+/// Subscribes; the stream must say that it starts at `from`.
+async fn subscribed(
+    cache: &mut CacheClient<Channel>,
+    request: v1::SubscribeRequest,
+    from: u64,
+) -> tonic::Streaming<v1::SubscribeResponse> {
+    let mut stream = soon(cache.subscribe(request)).await.expect("accepted").into_inner();
+    let start = soon(stream.message()).await.expect("no error").expect("no end");
+    assert_eq!((start.position, start.batch), (from, None));
+    stream
+}
+
 /// Reads a subscription until `count` records have come; returns them with their levels.
 async fn read(stream: &mut tonic::Streaming<v1::SubscribeResponse>, from: u64, count: usize) -> Vec<(Tag, Irradiance)> {
     let mut all = Vec::new();
@@ -125,7 +137,7 @@ async fn what_is_inserted_is_streamed_counted_and_digested() {
     for server in [Server::unix().await, Server::tcp().await] {
         let mut cache = server.cache();
         // A namespace that is not there yet: the subscriber waits.
-        let mut early = soon(cache.subscribe(subscribe(0))).await.expect("accepted").into_inner();
+        let mut early = subscribed(&mut cache, subscribe(0), 0).await;
         let batches = vec![
             convert::pack(&NAMESPACE, Tag::level(1), &records(0..4096)),
             convert::pack(&NAMESPACE, Tag::level(2), &records(4096..5000)),
@@ -137,7 +149,7 @@ async fn what_is_inserted_is_streamed_counted_and_digested() {
 
         let expected: Vec<_> = (0..5000).map(|id| (Tag::level(if id < 4096 { 1 } else { 2 }), record(id))).collect();
         assert_eq!(read(&mut early, 0, 5000).await, expected);
-        let mut late = soon(cache.subscribe(subscribe(4990))).await.expect("accepted").into_inner();
+        let mut late = subscribed(&mut cache, subscribe(4990), 4990).await;
         assert_eq!(read(&mut late, 4990, 10).await, expected[4990..]);
 
         let info = soon(cache.info(v1::InfoRequest {})).await.expect("info").into_inner();
@@ -188,8 +200,8 @@ async fn a_bad_batch_is_refused_by_name_and_the_connection_stays_usable() {
 async fn a_subscriber_that_does_not_read_holds_nobody_back() {
     let server = Server::tcp().await;
     let mut cache = server.cache();
-    let deaf = soon(cache.subscribe(subscribe(0))).await.expect("accepted").into_inner();
-    let mut keen = soon(cache.subscribe(subscribe(0))).await.expect("accepted").into_inner();
+    let deaf = subscribed(&mut cache, subscribe(0), 0).await;
+    let mut keen = subscribed(&mut cache, subscribe(0), 0).await;
     for at in 0..40 {
         let batch = convert::pack(&NAMESPACE, Tag::level(1), &records(at * 4096..(at + 1) * 4096));
         insert(&mut cache, vec![batch]).await.expect("sound");
@@ -297,7 +309,7 @@ fn ask(worker: &str) -> v1::LeaseRequest {
     v1::LeaseRequest { worker: worker.into(), version: VERSION.into() }
 }
 
-/// Does whatever it is given, for ever: one record for each tile in the first round, then none.
+/// Does whatever it is given, for ever: one record for each tile in the first step, then none.
 async fn work(server: &Server, name: &str) -> Infallible {
     let (mut cache, mut frames) = (server.cache(), server.frames());
     loop {
@@ -306,7 +318,10 @@ async fn work(server: &Server, name: &str) -> Infallible {
         let step = lease.step.expect("a step");
         let tiles = lease.tile_from..lease.tile_to;
         let gathered = if step.index == 0 { records(tiles.clone()) } else { vec![] };
-        insert(&mut cache, vec![convert::pack(&NAMESPACE, Tag::level(1), &gathered)]).await.expect("sound");
+        let described = soon(frames.describe(v1::DescribeRequest { frame: lease.frame })).await.expect("there");
+        let draft = convert::namespace(&described.into_inner().draft).expect("32 bytes");
+        let batch = convert::pack(&draft, Tag { level: 1, step: step.index }, &gathered);
+        insert(&mut cache, vec![batch]).await.expect("sound");
         // The last of the three tiles is half as wide.
         let pixels = |tile| v1::FrameTile { tile, pixels: vec![1; if tile == 2 { 8 } else { 16 } * 16 * 52].into() };
         let request = v1::CompleteRequest {
@@ -353,6 +368,14 @@ async fn a_frame_is_filled_by_two_workers_and_told_to_its_owner() {
     assert_eq!(tiles, [0, 1, 2]);
     assert_eq!((done.records, done.leases_lost, done.counts.len()), (3, 0, 1));
     assert_eq!(done.rounds, steps);
+    // What the frame gathered is the namespace's now, and the draft is no more.
+    let info = soon(server.cache().info(v1::InfoRequest {})).await.expect("info").into_inner();
+    let held: Vec<_> = info.namespaces.iter().map(|n| (n.namespace.to_vec(), n.records, n.digest.clone())).collect();
+    assert_eq!(held, [(NAMESPACE.0.to_vec(), 3, done.digest.clone())]);
+    assert_eq!(info.namespaces[0].label.as_ref().map(|l| l.scene.as_str()), Some("box.glb"));
+    let mut again = soon(frames.open(open(VERSION))).await.expect("opened").into_inner();
+    let told = soon(again.message()).await.expect("no error").expect("told").event;
+    assert!(matches!(told, Some(Event::Opened(opened)) if opened.base_records == 3 && opened.base == done.digest));
     let described = soon(frames.describe(v1::DescribeRequest { frame: frame.expect("opened") })).await;
     assert!(described.is_err_and(|status| status.code() == Code::NotFound), "a finished frame is forgotten");
     server.stop().await;
@@ -446,7 +469,7 @@ async fn health_and_reflection_answer() {
 async fn shutdown_sends_away_those_who_wait() {
     let server = Server::unix().await;
     let (mut cache, mut frames) = (server.cache(), server.frames());
-    let mut subscription = soon(cache.subscribe(subscribe(0))).await.expect("accepted").into_inner();
+    let mut subscription = subscribed(&mut cache, subscribe(0), 0).await;
     let waiting = tokio::spawn(async move { frames.lease(ask("w")).await });
     // The worker is known as soon as it waits.
     let known = async { while cache.info(v1::InfoRequest {}).await.expect("info").into_inner().workers == 0 {} };

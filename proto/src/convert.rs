@@ -39,6 +39,9 @@ pub enum Malformed {
     /// An entry that says nothing this build understands.
     #[error("entry of an unknown kind: made by a newer build?")]
     Unknown,
+    /// A draft that would be published to itself.
+    #[error("publication: draft and namespace are the same")]
+    Itself,
     /// A text that is too long.
     #[error("{field} has {got} bytes, expected at most {most}")]
     Long {
@@ -166,10 +169,10 @@ pub fn entry<C: Cached>(entry: &v1::Entry) -> Result<Checked<C>, Malformed> {
             let draft_of = (!label.draft_of.is_empty()).then(|| namespace(&label.draft_of)).transpose()?;
             Ok(Checked::Label(namespace(&label.namespace)?, draft_of, label.clone()))
         }
-        Some(v1::entry::Entry::Publication(publication)) => Ok(Checked::Publication {
-            draft: namespace(&publication.draft)?,
-            namespace: namespace(&publication.namespace)?,
-        }),
+        Some(v1::entry::Entry::Publication(publication)) => {
+            let (draft, namespace) = (namespace(&publication.draft)?, namespace(&publication.namespace)?);
+            if draft == namespace { Err(Malformed::Itself) } else { Ok(Checked::Publication { draft, namespace }) }
+        }
         None => Err(Malformed::Unknown),
     }
 }
