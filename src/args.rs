@@ -61,12 +61,12 @@ pub struct RenderArgs {
     /// No progress and no closing line; warnings and errors only
     #[arg(long)]
     pub quiet: bool,
+    /// Keep records in this directory between renders, and use those it has of the same scene and settings
+    #[arg(long, value_name = "DIR", conflicts_with = "server")]
+    pub cache: Option<PathBuf>,
     /// Not available yet
     #[arg(long, value_name = "E")]
     pub error: Option<String>,
-    /// Not available yet
-    #[arg(long, value_name = "DIR")]
-    pub cache: Option<PathBuf>,
     /// How own workers reach their server.
     #[arg(long, hide = true, value_enum, default_value_t)]
     pub transport: Transport,
@@ -78,10 +78,11 @@ impl RenderArgs {
     /// # Errors
     /// [`Failure::Usage`].
     pub fn check(&self) -> Result<(), Failure> {
-        for (given, name) in [(self.error.is_some(), "--error"), (self.cache.is_some(), "--cache")] {
-            if given {
-                return Err(Failure::usage(format!("{name} is not available yet")));
-            }
+        if self.error.is_some() {
+            return Err(Failure::usage("--error is not available yet"));
+        }
+        if let Some(cache) = self.cache.as_ref().filter(|cache| cache.exists() && !cache.is_dir()) {
+            return Err(Failure::usage(format!("--cache {}: expected a directory", cache.display())));
         }
         if self.server.is_none() && self.workers == Some(0) {
             return Err(Failure::usage("--workers 0 needs --server: nobody would render"));

@@ -14,8 +14,11 @@ use worker::client::Address;
 
 use crate::failure::Failure;
 
-/// How long a server may take until it listens.
-const READY: Duration = Duration::from_secs(20);
+/// How long a server may take until it listens; one that recovers a large cache takes seconds.
+const READY: Duration = Duration::from_secs(120);
+
+/// How long a server may take to close its cache.
+const CLOSE: Duration = Duration::from_secs(10);
 
 /// What the server prints before its address; see `cache_server::run`.
 const LISTENING: &str = "listening on ";
@@ -53,9 +56,9 @@ pub enum Event {
     },
 }
 
-/// One child. Dropping it kills the process; [`Children::stop`] also waits for its end.
+/// One child. Dropping it ends the process; [`Children::stop`] also waits for its end.
 struct Running {
-    kill: oneshot::Sender<()>,
+    end: oneshot::Sender<()>,
     watch: JoinHandle<()>,
 }
 
@@ -63,6 +66,8 @@ struct Running {
 pub struct Children {
     program: PathBuf,
     folder: Option<TempDir>,
+    /// Where the server listens; one started in its place listens there too.
+    address: Option<Address>,
     server: Option<Running>,
     /// By name.
     workers: BTreeMap<String, Running>,
@@ -79,32 +84,43 @@ impl Children {
         let program = std::env::current_exe()
             .map_err(|e| Failure::failed(format!("cannot find the program's own file to start workers: {e}")))?;
         let events = mpsc::unbounded_channel();
-        Ok(Self { program, folder: None, server: None, workers: BTreeMap::new(), started: 0, events })
+        Ok(Self { program, folder: None, address: None, server: None, workers: BTreeMap::new(), started: 0, events })
     }
 
-    /// Starts a server and waits until it listens: its address.
+    /// Starts a server and waits until it listens: its address, which stays the same for one started after it ended.
     ///
     /// # Errors
     /// When it does not come up.
-    pub async fn start_server(&mut self, transport: Transport) -> Result<Address, Failure> {
+    pub async fn start_server(&mut self, transport: Transport, cache: Option<&Path>) -> Result<Address, Failure> {
         let failed = |e: &dyn std::fmt::Display| Failure::failed(format!("cannot start a server: {e}"));
-        // Private (0700) by tempfile's own doing.
-        let folder = tempfile::Builder::new().prefix("ambience-").tempdir().map_err(|e| failed(&e))?;
+        let folder = match self.folder.take() {
+            Some(folder) => folder,
+            // Private (0700) by tempfile's own doing.
+            None => tempfile::Builder::new().prefix("ambience-").tempdir().map_err(|e| failed(&e))?,
+        };
         let mut command = self.command("serve");
         command.arg("--private").arg(folder.path());
-        match transport {
-            Transport::Unix => command.args(["--listen", &format!("unix:{}", socket(folder.path()))]),
-            Transport::Tcp => command.args(["--listen", "127.0.0.1:0"]),
+        let listen = match (&self.address, transport) {
+            (Some(address), _) => address.to_string(),
+            (None, Transport::Unix) => format!("unix:{}", socket(folder.path())),
+            (None, Transport::Tcp) => "127.0.0.1:0".into(),
         };
+        command.args(["--listen", &listen]);
+        if let Some(cache) = cache {
+            command.arg("--data").arg(cache);
+        }
         self.folder = Some(folder);
         let mut child = command.stdout(Stdio::piped()).spawn().map_err(|e| failed(&e))?;
         let stdout = child.stdout.take();
-        self.server = Some(self.watch(child, "server".into(), Event::ServerEnded));
+        let patience = cache.map_or(Duration::ZERO, |_| CLOSE);
+        self.server = Some(self.watch(child, "server".into(), patience, Event::ServerEnded));
         let stdout = stdout.ok_or_else(|| failed(&"it has no output"))?;
         let address = tokio::time::timeout(READY, listening(stdout));
         let address = address.await.map_err(|_| failed(&format!("not listening after {} s", READY.as_secs())))?;
         let Some(address) = address else { return Err(self.why().await) };
-        address.parse().map_err(|e: String| failed(&e))
+        let address: Address = address.parse().map_err(|e: String| failed(&e))?;
+        self.address = Some(address.clone());
+        Ok(address)
     }
 
     /// What a server said that ended before it listened.
@@ -137,7 +153,7 @@ impl Children {
             let (name, title) = (name.clone(), title.clone());
             move |status| Event::WorkerEnded { name, title, status }
         };
-        let running = self.watch(child, title, ended);
+        let running = self.watch(child, title, Duration::ZERO, ended);
         self.workers.insert(name, running);
         Ok(())
     }
@@ -161,16 +177,16 @@ impl Children {
         self.workers.keys()
     }
 
-    /// Kills and reaps every child, and removes the private folder. Nothing they were doing is of use any more.
+    /// Ends and reaps every child, and removes the private folder. Nothing they were doing is of use any more.
     pub async fn stop(&mut self) {
         let all: Vec<_> = std::mem::take(&mut self.workers).into_values().chain(self.server.take()).collect();
-        let watches: Vec<_> = all.into_iter().map(|r| (drop(r.kill), r.watch).1).collect();
+        let watches: Vec<_> = all.into_iter().map(|r| (drop(r.end), r.watch).1).collect();
         for watch in watches {
             // It only fails when the runtime is going away.
             drop(watch.await);
         }
         while self.events.1.try_recv().is_ok() {}
-        self.folder = None;
+        (self.folder, self.address) = (None, None);
     }
 
     fn command(&self, subcommand: &str) -> Command {
@@ -186,20 +202,22 @@ impl Children {
         command
     }
 
-    /// Forwards a child's stderr, waits for its end or kills it.
+    /// Forwards a child's stderr, waits for its end or ends it: kills it, or if it is given `patience` asks it to end and
+    /// kills it after that.
     fn watch(
         &self,
         mut child: Child,
         title: String,
+        patience: Duration,
         ended: impl FnOnce(ExitStatus) -> Event + Send + 'static,
     ) -> Running {
         let events = self.events.0.clone();
-        let (kill, killed) = oneshot::channel::<()>();
+        let (end, asked) = oneshot::channel::<()>();
         let lines = child.stderr.take().map(|stderr| tokio::spawn(forward(stderr, title, events.clone())));
         let watch = tokio::spawn(async move {
             let by_itself = tokio::select! {
                 status = child.wait() => Some(status),
-                _ = killed => None,
+                _ = asked => None,
             };
             match by_itself {
                 Some(status) => {
@@ -211,11 +229,25 @@ impl Children {
                         drop(events.send(ended(status)));
                     }
                 }
-                // Fails only when it has ended.
-                None => drop(child.kill().await),
+                None => {
+                    terminate(&child, patience);
+                    drop(tokio::time::timeout(patience, child.wait()).await);
+                    // Fails only when it has ended.
+                    drop(child.kill().await);
+                }
             }
         });
-        Running { kill, watch }
+        Running { end, watch }
+    }
+}
+
+/// Asks a child to end, if it is given time for that.
+fn terminate(child: &Child, patience: Duration) {
+    #[cfg(unix)]
+    if let Some(pid) = child.id().and_then(|id| i32::try_from(id).ok()).filter(|_| !patience.is_zero()) {
+        use nix::sys::signal::{Signal, kill};
+        // Fails only when it has ended.
+        let _ = kill(nix::unistd::Pid::from_raw(pid), Signal::SIGTERM);
     }
 }
 

@@ -1,6 +1,6 @@
 //! `ambience`: the one command users type. Here it is only wired: each subcommand has its room.
 //!
-//! - [`args`], [`render`], [`children`], [`progress`], [`stats`]: `render`.
+//! - [`args`], [`render`], [`children`], [`familiar`], [`progress`], [`stats`]: `render`.
 //! - [`compare`]: `compare`. `serve` and `worker` run the libraries `cache-server` and `worker`.
 //! - [`parent`]: children end with their parent. [`failure`]: exit codes. [`say`]: stdout and stderr.
 
@@ -14,6 +14,7 @@ mod args;
 mod children;
 mod compare;
 mod failure;
+mod familiar;
 mod parent;
 mod progress;
 mod render;

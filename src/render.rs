@@ -19,6 +19,7 @@ use worker::world::World;
 use crate::args::RenderArgs;
 use crate::children::{Children, Event, how};
 use crate::failure::Failure;
+use crate::familiar;
 use crate::progress::{Progress, phase_name};
 use crate::say;
 use crate::stats::{Stats, hex};
@@ -88,7 +89,8 @@ async fn render(args: &RenderArgs, children: &mut Children) -> Result<(), Failur
     for warning in &job.warnings {
         progress.note(&format!("warning: {warning}"));
     }
-    let mut render = Render { args, children, stats, progress, spare: RESTARTS, declined: HashSet::new() };
+    let declined = HashSet::new();
+    let mut render = Render { args, children, stats, progress, spare: RESTARTS, base: None, declined };
     let (film, done) = render.picture(&job).await?;
     // Reaped first, so that their memory is in the statistics.
     render.children.stop().await;
@@ -135,6 +137,13 @@ enum End {
     ServerDied(String),
 }
 
+/// The records of its namespace a frame began with.
+#[derive(Clone, PartialEq, Eq, Debug)]
+struct Base {
+    digest: Vec<u8>,
+    records: u64,
+}
+
 struct Render<'a> {
     args: &'a RenderArgs,
     children: &'a mut Children,
@@ -142,15 +151,18 @@ struct Render<'a> {
     progress: Progress,
     /// Restarts left.
     spare: u32,
+    /// Which records the first attempt began with.
+    base: Option<Base>,
     /// Names of workers that cannot do the frame.
     declined: HashSet<String>,
 }
 
 impl Render<'_> {
-    /// Renders the frame, from its beginning again whenever the server was lost: what depends on nothing but the scene
-    /// and the settings comes out the same.
+    /// Renders the frame, from its beginning again whenever the server was lost: what depends on nothing but the scene,
+    /// the settings and the records it began with comes out the same. What was gathered before comes back from the
+    /// server's disk or from its workers.
     async fn picture(&mut self, job: &Job) -> Result<(Film, v1::FrameDone), Failure> {
-        let mut server = self.start().await?;
+        let mut server = self.start(job).await?;
         loop {
             let mut film = Film::new(&job.settings);
             match self.attempt(job, &server, &mut film).await? {
@@ -171,22 +183,24 @@ impl Render<'_> {
                     }
                     self.spare -= 1;
                     self.progress.note(&format!("warning: the server ended, {how}; starting the frame again"));
-                    // The workers too: what they hold is of a log that no longer exists.
-                    self.children.stop().await;
-                    server = self.start().await?;
+                    self.stats.phase("start");
+                    server = self.children.start_server(self.args.transport, self.args.cache.as_deref()).await?;
                 }
             }
         }
     }
 
     /// Starts what is to be started: the server's address.
-    async fn start(&mut self) -> Result<Address, Failure> {
+    async fn start(&mut self, job: &Job) -> Result<Address, Failure> {
         self.stats.phase("start");
         self.progress.phase("starting");
         let server = match &self.args.server {
             Some(server) => server.clone(),
-            None => self.children.start_server(self.args.transport).await?,
+            None => self.children.start_server(self.args.transport, self.args.cache.as_deref()).await?,
         };
+        if let Some(cache) = &self.args.cache {
+            familiar::note(&server, &job.spec, cache).await?.iter().for_each(|note| self.progress.note(note));
+        }
         self.stats.workers = self.args.workers().into();
         for _ in 0..self.args.workers() {
             self.children.start_worker(&server, self.args.threads)?;
@@ -225,7 +239,8 @@ impl Render<'_> {
                 }
                 Some(FrameEvent::Declined(declined)) => self.decline(declined)?,
                 Some(FrameEvent::Done(done)) => return Ok(End::Done(done)),
-                Some(FrameEvent::Opened(_)) | None => {}
+                Some(FrameEvent::Opened(opened)) => self.opened(opened),
+                None => {}
             }
         }
     }
@@ -236,9 +251,10 @@ impl Render<'_> {
         server: &Address,
         frames: &Frames,
     ) -> Result<Result<Streaming<v1::FrameEvent>, End>, Failure> {
+        let base: Vec<u8> = self.base.as_ref().map_or_else(Vec::new, |base| base.digest.clone());
         let opening = client::retry(|| {
-            let request =
-                v1::OpenRequest { spec: Some(job.spec.clone()), version: VERSION.into(), base: Default::default() };
+            let (spec, base) = (Some(job.spec.clone()), base.clone().into());
+            let request = v1::OpenRequest { spec, version: VERSION.into(), base };
             let mut frames = frames.clone();
             async move { frames.open(request).await }
         });
@@ -280,6 +296,19 @@ impl Render<'_> {
             }
         }
         Ok(None)
+    }
+
+    fn opened(&mut self, opened: v1::FrameOpened) {
+        let base = Base { digest: opened.base.to_vec(), records: opened.base_records };
+        if let Some(before) = self.base.as_ref().filter(|before| **before != base) {
+            let (before, now) = (before.records, base.records);
+            self.progress.note(&format!(
+                "warning: the picture was begun with {before} records of the server, which it lost; now with {now}: \
+                 within the same error, but not the same bits"
+            ));
+        }
+        self.stats.base = base.records;
+        self.base = Some(base);
     }
 
     fn decline(&mut self, declined: v1::FrameDeclined) -> Result<(), Failure> {

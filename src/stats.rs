@@ -16,6 +16,8 @@ pub struct Stats {
     pub workers: usize,
     /// Own workers that died.
     pub workers_lost: u32,
+    /// Records the frame began with.
+    pub base: u64,
     /// Own servers that died.
     pub servers_lost: u32,
     /// Packed pixels that came, bytes.
@@ -69,6 +71,8 @@ impl Stats {
         cpu.insert("render_process".into(), json!(usage.cpu_self));
         cpu.insert("own_children".into(), json!(usage.cpu_children));
         let mut records = by_phase("records.", whole);
+        records.insert("base".into(), json!(self.base));
+        records.insert("reused".into(), count("reused"));
         records.insert("total".into(), json!(done.records));
         let bytes_of = |name| counts.get(name).copied().unwrap_or(0.0);
         let bytes = bytes_of("bytes.inserted") + bytes_of("bytes.subscribed") + bytes_of("bytes.tiles");
