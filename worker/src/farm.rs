@@ -3,25 +3,25 @@
 //! Each of its threads holds one lease at a time. What a lease yields depends on the frame, the step and the tiles alone,
 //! so a lease that is lost on the way is simply done again by somebody.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet};
 use std::hash::{BuildHasher as _, Hasher as _};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use anyhow::Context as _;
 use cache_core::Namespace;
-use cache_proto::{VERSION, v1};
+use cache_proto::{VERSION, convert, v1};
 use tokio::sync::OnceCell;
 use tokio::task::JoinSet;
+use tokio::time::Instant;
 use tonic::{Code, Status};
 use tracing::{debug, info, warn};
 
 use crate::client::{self, Address, Cache, Frames};
 use crate::follow::{self, Follower};
 use crate::frame::Frame;
+use crate::job::{Dropped, Job, Known, Work, off_thread};
 use crate::replica::{Caches, ReplicaError};
-use crate::task::{self, Done};
-use crate::{scene, spec};
+use crate::task::Done;
 
 /// Leases live a few seconds on the server; this is several times as often.
 const RENEW: Duration = Duration::from_millis(1500);
@@ -61,7 +61,7 @@ pub struct WorkerArgs {
 /// The server is of another version, or has been away for [`client::PATIENCE`].
 pub async fn run(args: WorkerArgs) -> anyhow::Result<()> {
     let threads = args.threads.map_or_else(|| cores().min(THREADS_MAX as usize), usize::from);
-    let worker = Arc::new(Worker::new(args.name.unwrap_or_else(unique_name), client::connect(&args.server)));
+    let worker = Arc::new(Worker::<Frame>::new(args.name.unwrap_or_else(unique_name), client::connect(&args.server)));
     info!(name = worker.name, %args.server, threads, "working");
     let ended = tokio::select! {
         lost = worker.clone().work(threads) => Err(lost),
@@ -153,30 +153,32 @@ impl From<Status> for Fault {
 }
 
 /// A frame made ready.
-struct Loaded {
-    frame: Arc<Frame>,
+struct Loaded<J> {
+    job: Arc<J>,
+    /// Where its records go.
+    draft: Namespace,
     /// Absent for methods without records.
     follower: Option<Arc<Follower>>,
     caches: Arc<Mutex<Caches>>,
 }
 
-type Slot = Arc<OnceCell<Arc<Loaded>>>;
+type Slot<J> = Arc<OnceCell<Arc<Loaded<J>>>>;
 
-/// One worker process as the server knows it.
-pub struct Worker {
+/// One worker process as the server knows it, and the kind of job it does.
+pub struct Worker<J> {
     name: String,
     cache: Cache,
     frames: Frames,
     /// Leases being worked on, which the server has not declared lost.
-    held: Mutex<HashSet<u64>>,
+    held: Mutex<BTreeSet<u64>>,
     /// Last used last.
-    loaded: Mutex<Vec<(u64, Slot)>>,
-    followers: Mutex<HashMap<Namespace, Arc<Follower>>>,
+    loaded: Mutex<Vec<(u64, Slot<J>)>>,
+    followers: Mutex<BTreeMap<Namespace, Arc<Follower>>>,
     /// Frames declined; every thread may hold a lease of one, its owner is told once.
-    declined: Mutex<HashSet<u64>>,
+    declined: Mutex<BTreeSet<u64>>,
 }
 
-impl Worker {
+impl<J: Job> Worker<J> {
     /// A worker named `name` for the server behind `channel`.
     pub fn new(name: String, channel: tonic::transport::Channel) -> Self {
         Self {
@@ -228,7 +230,7 @@ impl Worker {
             });
             match renewed.await {
                 Ok(kept) => {
-                    let kept: HashSet<u64> = kept.leases.into_iter().collect();
+                    let kept: BTreeSet<u64> = kept.leases.into_iter().collect();
                     lock(&self.held).retain(|lease| kept.contains(lease) || !asked.contains(lease));
                 }
                 Err(status) if status.code() == Code::NotFound => lock(&self.held).retain(|l| !asked.contains(l)),
@@ -297,7 +299,7 @@ impl Worker {
         let step = lease.step.clone().ok_or_else(|| Fault::Unfit("the server sent a lease without a step".into()))?;
         let loaded = self.frame(lease.frame).await?;
         let done = self.do_tiles(lease, &step, &loaded).await?;
-        let namespace = loaded.frame.namespace();
+        let namespace = &loaded.draft;
         let mut bytes_records = 0;
         if !done.records.is_empty() {
             let inserted = client::retry(|| {
@@ -334,45 +336,43 @@ impl Worker {
         self: &Arc<Self>,
         lease: &v1::Lease,
         step: &v1::Step,
-        loaded: &Arc<Loaded>,
+        loaded: &Arc<Loaded<J>>,
     ) -> Result<Done, Fault> {
         let (worker, id) = (self.clone(), lease.id);
-        let dropped = move || !lock(&worker.held).contains(&id);
-        let digest = cache_proto::convert::digest(&step.sealed_digest).map_err(|e| Fault::Unfit(e.to_string()))?;
+        let dropped: Dropped = Arc::new(move || !lock(&worker.held).contains(&id));
+        let digest = convert::digest(&step.sealed_digest).map_err(|e| Fault::Unfit(e.to_string()))?;
         if let Some(follower) = &loaded.follower
-            && !follower.reaches(step.sealed_position, &dropped).await
+            && !follower.reaches(step.sealed_position, &*dropped).await
         {
             return Err(Fault::Gone);
         }
-        let (ready, step, tiles) = (loaded.clone(), step.clone(), lease.tile_from..lease.tile_to);
-        let working = tokio::task::spawn_blocking(move || {
-            let clock = task::CpuClock::start();
-            let levels = match &ready.follower {
-                Some(follower) => {
-                    let mut caches = lock(&ready.caches);
-                    let part = follower.part(caches.position(), step.sealed_position)?;
-                    caches.seal(&part, digest)?
-                }
-                None => Vec::new(),
-            };
-            Ok(task::run(&ready.frame, &levels, &step, tiles, dropped, clock))
+        let (ready, position) = (loaded.clone(), step.sealed_position);
+        let sealing = off_thread(move || match &ready.follower {
+            Some(follower) => {
+                let mut caches = lock(&ready.caches);
+                let part = follower.part(caches.position(), position)?;
+                caches.seal(&part, digest)
+            }
+            None => Ok(Vec::new()),
         });
-        match working.await {
-            Ok(Ok(Some(done))) => Ok(done),
-            Ok(Ok(None) | Err(ReplicaError::Outdated { .. })) => Err(Fault::Gone),
-            Ok(Err(e @ ReplicaError::Digest { .. })) => {
+        let levels = match sealing.await.map_err(Fault::Unfit)? {
+            Ok(levels) => levels,
+            Err(ReplicaError::Outdated { .. }) => return Err(Fault::Gone),
+            Err(e @ ReplicaError::Digest { .. }) => {
                 // The server may have come back with another log than the one followed so far.
                 warn!("{e}; following the server's log anew");
                 self.forget(lease.frame, loaded);
-                Err(Fault::Gone)
+                return Err(Fault::Gone);
             }
-            Ok(Err(e)) => Err(Fault::Unfit(e.to_string())),
-            Err(panic) => Err(Fault::Unfit(format!("the worker failed: {panic}"))),
-        }
+            Err(e) => return Err(Fault::Unfit(e.to_string())),
+        };
+        let known: Known = Arc::new(|_| None);
+        let work = Work { step: step.clone(), tiles: lease.tile_from..lease.tile_to, levels, known, dropped };
+        loaded.job.clone().run(work).await.map_err(Fault::Unfit)?.ok_or(Fault::Gone)
     }
 
     /// A frame made ready, once, whoever asks first.
-    async fn frame(self: &Arc<Self>, id: u64) -> Result<Arc<Loaded>, Fault> {
+    async fn frame(self: &Arc<Self>, id: u64) -> Result<Arc<Loaded<J>>, Fault> {
         let slot = {
             let mut loaded = lock(&self.loaded);
             let slot = match loaded.iter().position(|(known, _)| *known == id) {
@@ -383,7 +383,7 @@ impl Worker {
             if loaded.len() > FRAMES_KEPT {
                 loaded.remove(0);
             }
-            let used: Vec<_> = loaded.iter().filter_map(|(_, s)| Some(*s.get()?.frame.namespace())).collect();
+            let used: Vec<_> = loaded.iter().filter_map(|(_, s)| Some(s.get()?.draft)).collect();
             // Frames evicted while in use keep their follower by themselves.
             lock(&self.followers).retain(|namespace, _| used.contains(namespace));
             slot
@@ -391,54 +391,32 @@ impl Worker {
         slot.get_or_try_init(|| self.load(id)).await.cloned()
     }
 
-    async fn load(self: &Arc<Self>, id: u64) -> Result<Arc<Loaded>, Fault> {
+    async fn load(self: &Arc<Self>, id: u64) -> Result<Arc<Loaded<J>>, Fault> {
         let described = client::retry(|| {
             let mut frames = self.frames.clone();
             async move { frames.describe(v1::DescribeRequest { frame: id }).await }
         });
         let described = described.await?;
-        let spec = described.spec.ok_or_else(|| Fault::Unfit("the server described nothing".into()))?;
-        let loading = tokio::task::spawn_blocking(move || prepare(&spec));
-        let frame = loading.await.map_err(|panic| Fault::Unfit(format!("the worker failed: {panic}")))?;
-        let frame = frame.map_err(|e| Fault::Unfit(format!("{e:#}")))?;
-        let (namespace, levels) = (*frame.namespace(), frame.levels());
-        let start = || Arc::new(Follower::start(self.cache.clone(), namespace));
-        let follower = (levels > 0).then(|| lock(&self.followers).entry(namespace).or_insert_with(start).clone());
-        let caches = Arc::new(Mutex::new(Caches::new(frame.settings().a, levels)));
-        Ok(Arc::new(Loaded { frame: Arc::new(frame), follower, caches }))
+        let job = J::prepare(&described).await.map_err(Fault::Unfit)?;
+        let draft = convert::namespace(&described.draft).map_err(|e| Fault::Unfit(e.to_string()))?;
+        let start = || Arc::new(Follower::start(self.cache.clone(), draft));
+        let follower = (job.levels() > 0).then(|| lock(&self.followers).entry(draft).or_insert_with(start).clone());
+        let caches = Arc::new(Mutex::new(Caches::new(job.a(), job.levels())));
+        Ok(Arc::new(Loaded { job: Arc::new(job), draft, follower, caches }))
     }
 
     /// Makes the next lease of a frame start over with an empty replica.
-    fn forget(&self, frame: u64, loaded: &Arc<Loaded>) {
+    fn forget(&self, frame: u64, loaded: &Arc<Loaded<J>>) {
         let mut frames = lock(&self.loaded);
         // Another thread may have done so already, and a new one be on its way.
         frames.retain(|(id, slot)| *id != frame || !slot.get().is_some_and(|l| Arc::ptr_eq(l, loaded)));
         let mut followers = lock(&self.followers);
-        let namespace = loaded.frame.namespace();
+        let namespace = &loaded.draft;
         let same = |f: &Arc<Follower>| loaded.follower.as_ref().is_some_and(|mine| Arc::ptr_eq(f, mine));
         if followers.get(namespace).is_some_and(same) {
             followers.remove(namespace);
         }
     }
-}
-
-/// Loads what a message describes, and makes sure that it is what its owner meant.
-fn prepare(described: &v1::FrameSpec) -> anyhow::Result<Frame> {
-    let settings = spec::settings(described).map_err(anyhow::Error::msg)?;
-    let scene = scene::load(described.scene.as_ref()).context("cannot load the scene")?;
-    anyhow::ensure!(
-        scene.hash[..] == described.scene_hash[..],
-        "{} has other content here than where the frame was opened",
-        described.scene
-    );
-    let frame = Frame::new(scene, settings);
-    anyhow::ensure!(
-        frame.namespace().0[..] == described.namespace[..],
-        "these settings lead to another namespace here: other builds of ambience at work"
-    );
-    let (here, there) = (frame.levels(), described.levels);
-    anyhow::ensure!(here == there, "the frame has {there} levels, {here} here: other builds of ambience at work");
-    Ok(frame)
 }
 
 /// A panic while holding one of these locks has been reported by then.

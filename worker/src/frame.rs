@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use cache_core::hemisphere::Strata;
 use cache_core::id::Random;
-use cache_core::{Irradiance, Namespace, Query, Sealed, rounds};
+use cache_core::{Irradiance, Namespace, Query, RecordId, Sealed, rounds};
 
 use crate::bsdf::Part;
 use crate::gather::{Gather, Site};
@@ -53,6 +53,8 @@ pub struct Counts {
     pub queries: u64,
     /// Those that found no record and went on as paths.
     pub misses: u64,
+    /// Records that were found and not gathered again.
+    pub reused: u64,
 }
 
 impl Counts {
@@ -62,6 +64,7 @@ impl Counts {
         self.shadow_rays += other.shadow_rays;
         self.queries += other.queries;
         self.misses += other.misses;
+        self.reused += other.reused;
     }
 }
 
@@ -105,7 +108,8 @@ impl Frame {
     }
 
     /// Tests the candidates of `tile` whose ranks lie in `ranks` and gathers a record of `level` where the sealed
-    /// cache covers none. The result depends on nothing but the frame, the arguments and the sealed records.
+    /// cache covers none, unless it is `known`. The records depend on nothing but the frame, the other arguments and the
+    /// sealed records.
     pub fn fill(
         &self,
         level: u32,
@@ -113,12 +117,13 @@ impl Frame {
         ranks: Range<u32>,
         tile: u32,
         sealed: &Levels,
+        known: &dyn Fn(RecordId) -> Option<Irradiance>,
     ) -> (Vec<Irradiance>, Counts) {
         let mut counts = Counts::default();
         let mut records = Vec::new();
-        for [x, y] in self.settings.pixels(tile) {
-            if ranks.contains(&rounds::rank(x, y))
-                && let Some(record) = self.candidate(level, pass, x, y, sealed, &mut counts)
+        for pixel in self.settings.pixels(tile) {
+            if ranks.contains(&rounds::rank(pixel[0], pixel[1]))
+                && let Some(record) = self.candidate(level, pass, pixel, sealed, known, &mut counts)
             {
                 records.push(record);
             }
@@ -131,9 +136,9 @@ impl Frame {
         &self,
         level: u32,
         pass: u32,
-        x: u32,
-        y: u32,
+        [x, y]: [u32; 2],
         sealed: &Levels,
+        known: &dyn Fn(RecordId) -> Option<Irradiance>,
         counts: &mut Counts,
     ) -> Option<Irradiance> {
         let site = self.site(level, pass, x, y, counts)?;
@@ -149,7 +154,12 @@ impl Frame {
             level,
             strata: &self.strata[usize::from(level > 1)],
         };
-        Some(gather.record(&site, counts))
+        let id = gather.id(&site);
+        if let Some(record) = known(id) {
+            counts.reused += 1;
+            return Some(record);
+        }
+        Some(gather.record(id, &site, counts))
     }
 
     fn tracer<'a>(&'a self, levels: &'a Levels) -> Tracer<'a> {

@@ -3,7 +3,7 @@
 use cache_core::hemisphere::Strata;
 use cache_core::id::{Origin, Random};
 use cache_core::math::Frame;
-use cache_core::{Cached, Irradiance, Namespace};
+use cache_core::{Cached, Irradiance, Namespace, RecordId};
 use glam::{Vec2, Vec3};
 
 use crate::frame::Counts;
@@ -34,8 +34,8 @@ pub struct Gather<'a> {
 }
 
 impl Gather<'_> {
-    /// Makes the record of a site: the same record, bit for bit, whoever makes it and when.
-    pub fn record(&self, site: &Site, counts: &mut Counts) -> Irradiance {
+    /// Which record belongs to a site.
+    pub fn id(&self, site: &Site) -> RecordId {
         let (position, normal) = (site.at.position, site.at.normal());
         let (radius_min, radius_max) = site.radius_bounds;
         let read = self.tracer.levels.get(self.level as usize).map(|l| l.digest()).unwrap_or_default();
@@ -48,7 +48,12 @@ impl Gather<'_> {
             seed: self.seed,
             read,
         };
-        let id = origin.id();
+        origin.id()
+    }
+
+    /// Makes the record `id` of a site: the same record, bit for bit, whoever makes it and when.
+    pub fn record(&self, id: RecordId, site: &Site, counts: &mut Counts) -> Irradiance {
+        let (radius_min, radius_max) = site.radius_bounds;
         let mut random = Random::of(id);
         // A turn of the strata about the normal, so that neighbouring records do not err alike.
         let frame = turned(site.at.frame, random.uniform());
@@ -58,8 +63,8 @@ impl Gather<'_> {
         let own = |v: Vec2| site.at.frame.tangential(frame.x * v.x + frame.y * v.y);
         Irradiance {
             id,
-            position,
-            normal,
+            position: site.at.position,
+            normal: site.at.normal(),
             radius: estimate.radius.clamp(f32::MIN_POSITIVE, 4.0 * self.tracer.world.radius),
             radius_min,
             radius_max,

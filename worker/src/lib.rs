@@ -18,7 +18,8 @@
 //! - [`client`]: the connection to a server.
 //! - [`replica`]: a copy of a namespace's log, and the caches sealed from a prefix of it.
 //! - [`follow`]: keeps a replica following the server.
-//! - [`task`]: the CPU work of one lease.
+//! - [`job`]: the seam between the protocol and the work.
+//! - [`task`]: the renderer's job.
 //! - [`farm`]: the worker process.
 //! - [`film`]: tiles become OUT.exr and OUT.png.
 //! - [`compare`]: how far a picture is from a reference.
@@ -46,6 +47,7 @@ pub mod solo;
 pub mod client;
 pub mod farm;
 pub mod follow;
+pub mod job;
 pub mod replica;
 pub mod spec;
 pub mod task;

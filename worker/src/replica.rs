@@ -218,7 +218,7 @@ mod tests {
                     gradient_t: [Vec2::ZERO; 3],
                     gradient_r: [Vec2::ZERO; 3],
                 };
-                (level, record)
+                (Tag::level(level), record)
             });
         prop::collection::vec(one, 1..40)
     }
@@ -226,8 +226,8 @@ mod tests {
     /// The server's side: its log and the digest of every prefix.
     fn server(entries: &[(Tag, Irradiance)]) -> (Vec<(Tag, Irradiance)>, Vec<Digest>) {
         let (mut set, mut digests) = (RecordSet::default(), vec![Digest::default()]);
-        for (level, record) in entries {
-            if set.insert(*level, *record) != Inserted::Known {
+        for (tag, record) in entries {
+            if set.insert(*tag, *record) != Inserted::Known {
                 digests.push(set.digest());
             }
         }
@@ -235,8 +235,8 @@ mod tests {
     }
 
     fn feed(replica: &mut Replica, log: &[(Tag, Irradiance)], from: usize) {
-        for (at, (level, record)) in log.iter().enumerate().skip(from) {
-            replica.apply(at as u64, &convert::pack(&NAMESPACE, *level, [record])).expect("sound batch");
+        for (at, (tag, record)) in log.iter().enumerate().skip(from) {
+            replica.apply(at as u64, &convert::pack(&NAMESPACE, *tag, [record])).expect("sound batch");
         }
     }
 
@@ -269,8 +269,8 @@ mod tests {
                 last = caches.seal(&part, digests[step]).expect("same records");
             }
             let mut expected: Levels = (0..2).map(|_| Arc::new(Sealed::new(0.8))).collect();
-            for (level, record) in latest(&log[..end]) {
-                if let Some(sealed) = expected.get_mut(level as usize - 1) {
+            for (tag, record) in latest(&log[..end]) {
+                if let Some(sealed) = expected.get_mut(tag.level as usize - 1) {
                     Arc::make_mut(sealed).extend([record]);
                 }
             }
@@ -305,10 +305,10 @@ mod tests {
             gradient_t: [Vec2::ZERO; 3],
             gradient_r: [Vec2::ZERO; 3],
         };
-        let batch = |id| convert::pack(&NAMESPACE, 1, [&record(id)]);
+        let batch = |id| convert::pack(&NAMESPACE, Tag::level(1), [&record(id)]);
         let mut replica = Replica::new(NAMESPACE);
         assert_eq!(replica.apply(1, &batch(5)), Err(ReplicaError::Gap { expected: 0, got: 1 }));
-        let foreign = convert::pack(&Namespace([8; 32]), 1, [&record(5)]);
+        let foreign = convert::pack(&Namespace([8; 32]), Tag::level(1), [&record(5)]);
         assert!(replica.apply(0, &foreign).expect_err("foreign").to_string().contains("another namespace"));
         assert_eq!(replica.apply(0, &batch(5)), Ok(1));
         assert_eq!(replica.apply(1, &batch(5)), Err(ReplicaError::Repeated(1)));

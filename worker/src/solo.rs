@@ -34,7 +34,7 @@ pub fn fill(frame: &Frame, order: Order) -> Levels {
             // The pixels of one rank are 64 apart; strictly sequential filling seals after each of them all the same.
             let chunk = if order == Order::Rounds { u32::MAX } else { 1 };
             for tiles in chunks(frame.settings().tiles(), chunk) {
-                let work = |tile| frame.fill(level, pass, ranks.clone(), tile, &levels).0;
+                let work = |tile| frame.fill(level, pass, ranks.clone(), tile, &levels, &|_| None).0;
                 let new: Vec<_> = tiles.into_par_iter().map(work).collect::<Vec<_>>().concat();
                 gathered += new.len() as u64;
                 Arc::make_mut(&mut levels[level as usize - 1]).extend(new);

@@ -1,47 +1,84 @@
-//! The CPU work of one lease, and the numbers told about it.
+//! The renderer's job: what comes of a lease, and the numbers told about it.
 
-use std::ops::Range;
+use std::sync::Arc;
 
+use anyhow::Context as _;
 use cache_core::rounds::Step;
 use cache_core::{Irradiance, Tag};
 use cache_proto::{convert, v1};
 
-use crate::frame::{Counts, Frame, Levels};
+use crate::frame::{Counts, Frame};
+use crate::job::{Job, Work, off_thread};
+use crate::{scene, spec};
 
 /// What came of a lease.
 #[derive(Default)]
 pub struct Done {
-    /// New records.
+    /// Records of the candidates that none covered, gathered or found.
     pub records: Vec<(Tag, Irradiance)>,
     /// Finished tiles.
     pub tiles: Vec<v1::FrameTile>,
-    counts: Counts,
-    cpu_seconds: f64,
+    /// What was counted.
+    pub counts: Counts,
+    /// CPU time it took.
+    pub cpu_seconds: f64,
 }
 
-/// Does the tiles of a step. `None` when `dropped` said, between two tiles, that nobody waits for them.
-pub fn run(
-    frame: &Frame,
-    levels: &Levels,
-    step: &v1::Step,
-    tiles: Range<u32>,
-    dropped: impl Fn() -> bool,
-    clock: CpuClock,
-) -> Option<Done> {
+impl Job for Frame {
+    async fn prepare(described: &v1::DescribeResponse) -> Result<Self, String> {
+        let spec = described.spec.clone().ok_or("the server described nothing")?;
+        off_thread(move || load(&spec)).await?.map_err(|e| format!("{e:#}"))
+    }
+
+    fn levels(&self) -> u32 {
+        self.levels()
+    }
+
+    fn a(&self) -> f32 {
+        self.settings().a
+    }
+
+    async fn run(self: Arc<Self>, work: Work) -> Result<Option<Done>, String> {
+        off_thread(move || run(&self, &work)).await
+    }
+}
+
+/// Loads what a message describes, and makes sure that it is what its owner meant.
+fn load(described: &v1::FrameSpec) -> anyhow::Result<Frame> {
+    let settings = spec::settings(described).map_err(anyhow::Error::msg)?;
+    let scene = scene::load(described.scene.as_ref()).context("cannot load the scene")?;
+    anyhow::ensure!(
+        scene.hash[..] == described.scene_hash[..],
+        "{} has other content here than where the frame was opened",
+        described.scene
+    );
+    let frame = Frame::new(scene, settings);
+    anyhow::ensure!(
+        frame.namespace().0[..] == described.namespace[..],
+        "these settings lead to another namespace here: other builds of ambience at work"
+    );
+    let (here, there) = (frame.levels(), described.levels);
+    anyhow::ensure!(here == there, "the frame has {there} levels, {here} here: other builds of ambience at work");
+    Ok(frame)
+}
+
+fn run(frame: &Frame, work: &Work) -> Option<Done> {
+    let clock = CpuClock::start();
     let mut done = Done::default();
     // The server counts tiles as we do; a range past the end would make tiles nobody can place.
-    for tile in tiles.start..tiles.end.min(frame.settings().tiles()) {
-        if dropped() {
+    for tile in work.tiles.start..work.tiles.end.min(frame.settings().tiles()) {
+        if (work.dropped)() {
             return None;
         }
-        let counts = match convert::plan_step(step) {
+        let counts = match convert::plan_step(&work.step) {
             Step::Fill { level, pass, ranks } => {
-                let (records, counts) = frame.fill(level, pass, ranks, tile, levels);
-                done.records.extend(records.into_iter().map(|r| (Tag { level, step: step.index }, r)));
+                let (records, counts) = frame.fill(level, pass, ranks, tile, &work.levels, &*work.known);
+                let tag = Tag { level, step: work.step.index };
+                done.records.extend(records.into_iter().map(|r| (tag, r)));
                 counts
             }
             Step::Pixels => {
-                let (pixels, counts) = frame.pixels(tile, levels);
+                let (pixels, counts) = frame.pixels(tile, &work.levels);
                 done.tiles.push(v1::FrameTile { tile, pixels: packed(&pixels).into() });
                 counts
             }
@@ -54,7 +91,7 @@ pub fn run(
 
 impl Done {
     /// The counts of `Complete`: `cpu_seconds.PHASE`, `records.PHASE`, `rays.path.PHASE`, `rays.shadow.PHASE` (PHASE is
-    /// `level N` or `pixels`), `queries`, `misses`, and of bytes on the wire `bytes.inserted` and `bytes.subscribed`
+    /// `level N` or `pixels`), `queries`, `misses`, `reused` (of the records, those found), and of bytes on the wire `bytes.inserted` and `bytes.subscribed`
     /// (packed records), `bytes.tiles` (packed pixels).
     pub fn counts(&self, step: &v1::Step, inserted: u64, subscribed: u64) -> Vec<v1::Count> {
         let phase = match step.level {
@@ -69,6 +106,7 @@ impl Done {
             (format!("rays.shadow.{phase}"), self.counts.shadow_rays as f64),
             ("queries".into(), self.counts.queries as f64),
             ("misses".into(), self.counts.misses as f64),
+            ("reused".into(), self.counts.reused as f64),
             ("bytes.inserted".into(), inserted as f64),
             ("bytes.subscribed".into(), subscribed as f64),
             ("bytes.tiles".into(), tiles as f64),
