@@ -283,6 +283,27 @@ async fn another_log_under_the_same_connection_is_noticed_by_its_digest() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_published_draft_is_left_alone_until_it_is_wanted_or_lost() {
+    let (script, channel) = Script::start();
+    let follower = follower(&script, &channel, 1..11).await;
+    let published = || State { closed: Some(Status::not_found("published")), ..State::default() };
+    script.replace(published());
+    tokio::time::sleep(Duration::from_secs(95)).await;
+    assert!((2..=5).contains(&script.with(|state| state.asked)));
+    // A frame fills it again.
+    script.with(|state| state.closed = None);
+    script.insert(SCENE, &(1..12).map(|id| entry(id, 0)).collect::<Vec<_>>());
+    let (dropped, began): (worker::job::Dropped, _) = (Arc::new(|| false), tokio::time::Instant::now());
+    assert!(follower.reaches(11, &dropped).await.expect("open"));
+    assert!(began.elapsed() < Duration::from_secs(2));
+    // And the server is lost after it was published again.
+    script.replace(published());
+    script.until(|state| (state.asked > 0).then_some(())).await;
+    script.replace(State::default());
+    script.until(|state| state.logs.get(&SCENE).filter(|log| log.len() == 11).map(drop)).await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_worker_that_may_not_read_ends_and_says_so() {
     for closed in [Status::permission_denied("not your namespace"), Status::unauthenticated("no token")] {
         let (script, channel) = Script::start();

@@ -31,6 +31,8 @@ pub struct State {
     pub refusals: VecDeque<Status>,
     /// Answer to subscriptions.
     pub closed: Option<Status>,
+    /// How often a subscription was asked for.
+    pub asked: u32,
     /// Size of every insert, records.
     pub inserts: Vec<usize>,
     /// Where each subscription started.
@@ -155,6 +157,7 @@ impl v1::cache_server::Cache for Script {
         let (script, mut changed) = (self.clone(), self.changed.subscribe());
         let life = changed.borrow().0;
         let (end, mut position) = self.with(|state| {
+            state.asked += 1;
             if let Some(status) = &state.closed {
                 return Err(status.clone());
             }
