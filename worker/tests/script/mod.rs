@@ -81,15 +81,18 @@ impl Script {
         self.changed.send_modify(|(life, _)| *life += 1);
     }
 
-    /// Waits until something is so.
+    /// Waits until something is so, ten minutes at most.
     pub async fn until<T>(&self, mut look: impl FnMut(&State) -> Option<T>) -> T {
         let mut changed = self.changed.subscribe();
-        loop {
-            if let Some(found) = look(&self.lock()) {
-                return found;
+        let waiting = async {
+            loop {
+                if let Some(found) = look(&self.lock()) {
+                    return found;
+                }
+                changed.changed().await.expect("the script lives");
             }
-            changed.changed().await.expect("the script lives");
-        }
+        };
+        tokio::time::timeout(Duration::from_secs(600), waiting).await.expect("it comes to be so")
     }
 
     /// Inserts as some other worker does.
