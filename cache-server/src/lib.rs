@@ -7,6 +7,7 @@
 //! - [`journal`]: the door to durable storage: an insert is acknowledged only after it took the batch.
 //! - [`replica`]: the record sets of all namespaces, as logs that can be read by position; no I/O.
 //! - [`store`]: the replica shared between tasks, and the one task that writes: journal, memory, acknowledgement.
+//! - [`archive`]: caches as files: united, exported, imported.
 //! - [`query`]: sealed levels kept ready to answer clients that hold no replica.
 //! - [`spec`]: what a frame asks for, checked once.
 //! - [`round`]: the tiles of one step: pending, leased or done; no I/O.
@@ -23,6 +24,7 @@ pub mod refusal;
 
 pub mod access;
 
+pub mod archive;
 pub mod journal;
 pub mod query;
 pub mod replica;
