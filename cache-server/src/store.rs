@@ -16,8 +16,9 @@ use tokio::sync::{mpsc, oneshot};
 
 use crate::bell::Bell;
 use crate::journal::Journal;
+use crate::limits::Limits;
 use crate::refusal::Refusal;
-use crate::replica::{Added, Limits, Mark, Replica};
+use crate::replica::{Added, Mark, Replica};
 
 /// Most entries that wait to be written; whoever brings more waits. An entry has at most half a megabyte.
 const QUEUE_MAX: usize = 64;
