@@ -128,9 +128,10 @@ impl Tokens {
         self.0.is_empty()
     }
 
-    /// How many there are.
-    pub fn len(&self) -> usize {
-        self.0.len()
+    /// The tenants they stand for, each once.
+    pub fn names(&self) -> Vec<&str> {
+        let names: std::collections::BTreeSet<_> = self.0.iter().map(|(_, tenant)| tenant.name()).collect();
+        names.into_iter().collect()
     }
 
     /// The tenant behind the value of an `authorization` header. What is compared are hashes, each with every entry, so
@@ -194,7 +195,7 @@ mod tests {
     fn a_token_stands_for_its_tenant() {
         let file = file(0o600, &format!("# who\n\nlight {LIGHT}\n  comp.2 \t{COMP}\nlight another-token-of-it\n"));
         let tokens = Tokens::load(file.path()).expect("sound");
-        assert_eq!(tokens.len(), 3);
+        assert_eq!(tokens.names(), ["comp.2", "light"]);
         for (token, tenant) in [(LIGHT, "light"), (COMP, "comp.2"), ("another-token-of-it", "light")] {
             assert_eq!(name(&tokens, &format!("Bearer {token}")).as_deref(), Some(tenant));
             assert_eq!(name(&tokens, &format!("bearer {token}")).as_deref(), Some(tenant));

@@ -12,6 +12,8 @@ use tokio::time::Sleep;
 use tokio_stream::Stream;
 use tonic::transport::server::Connected;
 
+use crate::metrics;
+
 /// A connection that brings no call it may make within this time is cut, whatever it does instead: nothing, half a
 /// handshake, guesses at tokens.
 pub const GREETING: Duration = Duration::from_secs(10);
@@ -90,7 +92,10 @@ where
             match ready!(self.incoming.as_mut().poll_next(context)) {
                 Some(Ok(io)) => match self.door.enter(io) {
                     Some(guest) => return Poll::Ready(Some(Ok(guest))),
-                    None => tracing::debug!(most = self.door.most, "a connection past the bound was closed"),
+                    None => {
+                        tracing::debug!(most = self.door.most, "a connection past the bound was closed");
+                        metrics::connection_refused();
+                    }
                 },
                 Some(Err(error)) => {
                     tracing::warn!(%error, "a connection could not be accepted");
@@ -148,11 +153,12 @@ impl<IO: AsyncRead + Unpin> AsyncRead for Guest<IO> {
         }
         if self.greeting.as_mut().is_some_and(|greeting| greeting.as_mut().poll(context).is_ready()) {
             tracing::debug!("a connection without a call was cut");
+            metrics::connection_refused();
             return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
         }
         let before = buffer.filled().len();
         ready!(Pin::new(&mut self.io).poll_read(context, buffer))?;
-        crate::metrics::received(buffer.filled().len() - before);
+        metrics::received(buffer.filled().len() - before);
         Poll::Ready(Ok(()))
     }
 }
@@ -160,7 +166,7 @@ impl<IO: AsyncRead + Unpin> AsyncRead for Guest<IO> {
 impl<IO: AsyncWrite + Unpin> AsyncWrite for Guest<IO> {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         let written = ready!(Pin::new(&mut self.io).poll_write(context, bytes))?;
-        crate::metrics::sent(written);
+        metrics::sent(written);
         Poll::Ready(Ok(written))
     }
 
@@ -170,7 +176,7 @@ impl<IO: AsyncWrite + Unpin> AsyncWrite for Guest<IO> {
         bytes: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
         let written = ready!(Pin::new(&mut self.io).poll_write_vectored(context, bytes))?;
-        crate::metrics::sent(written);
+        metrics::sent(written);
         Poll::Ready(Ok(written))
     }
 

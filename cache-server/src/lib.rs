@@ -24,6 +24,7 @@
 //! - [`tls`]: the server's certificate and key.
 //! - [`health`]: whether the server is ready, as the gRPC health service tells it.
 //! - [`serve`](mod@serve): all of these on sockets, and how it ends.
+//! - [`files`]: how many files may be open.
 //! - [`cli`]: the arguments of `cache-server`, which `ambience serve` re-uses.
 
 pub mod refusal;
@@ -58,7 +59,9 @@ pub mod serve;
 pub mod tls;
 
 pub mod cli;
+pub mod files;
 
 pub use cli::{ServeArgs, run};
+pub use limits::Limits;
 pub use listen::{Bound, Listen, ServeError, bind};
 pub use serve::{Config, Node, serve, serve_on};

@@ -28,6 +28,7 @@ use crate::health::Health;
 use crate::journal::{Journal, Nowhere};
 use crate::limits::Limits;
 use crate::listen::{Bound, ServeError, Socket};
+use crate::metrics::{self, Census};
 use crate::store::Store;
 use crate::tls::Tls;
 
@@ -110,20 +111,32 @@ impl Node {
         let (store, writer) = Store::open(limits, journal)?;
         tokio::spawn(writer.run());
         let store = Arc::new(store);
-        let board = Arc::new(Board::new(store.clone(), Clock::start(), first_number));
+        let board = Arc::new(Board::new(store.clone(), Clock::start(), limits, first_number));
         let (door, gate) = (Arc::new(Door::new(limits.connections)), Gate::new(tokens, limits.inflow));
         // The range of the limit is far smaller than a u32.
         let calls = u32::try_from(limits.calls).unwrap_or(u32::MAX);
         Ok(Self { store, board, door, gate, health: Arc::default(), tls, calls })
     }
 
-    /// Takes back lost leases, for ever.
+    /// Takes back lost leases, and tells how things stand, for ever.
     pub async fn tick(&self) -> Infallible {
         let mut ticks = tokio::time::interval(TICK);
         loop {
             ticks.tick().await;
             self.board.tick();
+            let ready = self.store.works();
+            self.health.tell(ready).await;
+            self.show(ready);
         }
+    }
+
+    fn show(&self, ready: bool) {
+        let (records, namespaces) = self.store.replica().census();
+        let ((frames, workers), (leases, oldest_lease)) = (self.board.census(), self.board.leases());
+        let (connections, subscribers) = (self.door.open() as u64, self.store.subscribers());
+        let census =
+            Census { records, namespaces, connections, subscribers, frames, workers, leases, oldest_lease, ready };
+        metrics::show(census);
     }
 
     /// Sends away all who wait: subscribers, owners of frames, workers without a lease.
@@ -158,7 +171,7 @@ where
 {
     let cache = CacheServer::new(CacheService::new(node.store.clone(), node.board.clone()));
     let frames = FramesServer::new(FramesService::new(node.board));
-    node.health.tell(true).await;
+    node.health.tell(node.store.works()).await;
     let reflection = tonic_reflection::server::Builder::configure()
         .register_encoded_file_descriptor_set(cache_proto::DESCRIPTORS)
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
