@@ -95,7 +95,7 @@ fn main() -> ExitCode {
         Command::Render(args) => block_on(render::run(args)),
         Command::Serve { serve, owned } => {
             owned.watch();
-            cache_server::cli::log_to_stderr();
+            cache_server::cli::log_to_stderr(serve.log_format);
             block_on(async { cache_server::run(serve).await.map_err(serve_failure) })
         }
         Command::Worker { worker, owned } => {

@@ -19,7 +19,8 @@ use cache_proto::convert::{self, BATCH_RECORDS_MAX, Checked, Malformed};
 use cache_proto::v1;
 use cache_proto::v1::entry::Entry as Kind;
 
-use crate::replica::{Limits, Replica};
+use crate::limits::Limits;
+use crate::replica::Replica;
 
 /// Why a cache could not be read or written, in one line.
 #[derive(Debug, thiserror::Error)]
@@ -73,7 +74,7 @@ pub struct Archive {
 
 impl Default for Archive {
     fn default() -> Self {
-        let limits = Limits { namespaces: usize::MAX, records: usize::MAX };
+        let limits = Limits { namespaces: usize::MAX, records: usize::MAX, ..Limits::default() };
         Self { replica: Replica::new(limits), publications: BTreeSet::new() }
     }
 }

@@ -202,6 +202,25 @@ fn last(database: &Database) -> Result<Place, redb::Error> {
     last.transpose().map(Option::unwrap_or_default).map_err(|e| redb::Error::Corrupted(e.to_string()))
 }
 
+/// Whether a journal can be opened in a directory, or the directory made. What is in it is not looked at: opening it may
+/// mean to mend it.
+///
+/// # Errors
+/// [`OpenError`].
+pub fn usable(directory: &Path) -> Result<(), OpenError> {
+    if directory.exists() {
+        return lock(directory).map(drop);
+    }
+    let parent = directory.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let error = match std::fs::metadata(parent) {
+        Ok(there) if there.permissions().readonly() => io::ErrorKind::PermissionDenied.into(),
+        Ok(there) if !there.is_dir() => io::ErrorKind::NotADirectory.into(),
+        Ok(_) => return Ok(()),
+        Err(error) => error,
+    };
+    Err(OpenError::Directory { directory: directory.into(), error })
+}
+
 /// Takes the directory for this process, making it if it is not there.
 pub(super) fn lock(directory: &Path) -> Result<File, OpenError> {
     let failed = |error: io::Error| OpenError::Directory { directory: directory.into(), error };
