@@ -49,14 +49,13 @@ pub fn batch(data: &[u8]) {
 
 /// The sound entries of a payload.
 fn entries(payload: &[u8]) -> Vec<Checked<Irradiance>> {
-    let entries = value::entries(payload).unwrap_or_default();
-    let sound = |entry: &v1::Entry| {
+    let sound = |entry: v1::Entry| {
         if let Some(v1::entry::Entry::Batch(batch)) = &entry.entry {
             unpack(batch);
         }
-        convert::entry::<Irradiance>(entry).ok()
+        convert::entry::<Irradiance>(&entry).ok()
     };
-    entries.iter().filter_map(sound).collect()
+    value::entries(payload).map_while(Result::ok).take(STEPS_MAX).filter_map(sound).collect()
 }
 
 fn unpack(batch: &v1::RecordBatch) {

@@ -1,8 +1,8 @@
 //! Where the fuzzer begins: small inputs that reach far, made here so that no binary files need to be kept.
 
 use cache_core::{Cached as _, Irradiance, Namespace, RecordId, Tag};
-use cache_proto::v1::{self, entry::Entry as Kind};
 use cache_proto::convert;
+use cache_proto::v1::{self, entry::Entry as Kind};
 use cache_server::journal::value::Place;
 use glam::{Vec2, Vec3};
 use prost::Message as _;
@@ -137,7 +137,8 @@ fn scene() -> Vec<Vec<u8>> {
 "images":[{"uri":"data:image/png;base64,iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="}],
 "accessors":[{"bufferView":0,"componentType":5126,"count":3,"type":"VEC3"}],"bufferViews":[{"buffer":0,
 "byteLength":36}],"buffers":[{"byteLength":36,"uri":"data:;base64,AAAAAAAAAAAAAAAAAACAPwAAAAAAAAAAAAAAAAAAgD8AAAAA"}]}"#;
-    let shapes = b"void plastic red 0 0 5 .7 .1 .1 0.05 0.1\nvoid metal m 0 0 5 .7 .1 .1 0.9 0\nvoid glow g 0 0 4 1 1 1 0
+    let shapes =
+        b"void plastic red 0 0 5 .7 .1 .1 0.05 0.1\nvoid metal m 0 0 5 .7 .1 .1 0.9 0\nvoid glow g 0 0 4 1 1 1 0
 m sphere s 0 0 4 0 0 0 1\nred cylinder c 0 0 7 0 0 0 0 0 1 .5\nred cone k 0 0 8 0 0 0 0 0 1 .5 .1
 red ring r 0 0 8 0 0 0 0 0 1 .5 1\ng source sky 0 0 4 0 0 1 180\nred alias r2 red
 void mixfunc mix 4 red m .3 . 0 0\nmix bubble b 0 0 4 3 0 0 1

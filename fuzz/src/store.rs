@@ -23,7 +23,7 @@ const CRASHED: u8 = 2;
 /// The first byte chooses the file: the bytes that follow, a journal patched by them, or values placed by them.
 pub fn store(data: &[u8]) {
     let Some((kind, rest)) = data.split_first() else { return };
-    drop(value::open(rest).map(|(_, payload)| value::entries(payload)));
+    drop(value::open(rest).map(|(_, payload)| value::entries(payload).count()));
     let (bytes, written) = match kind % 4 {
         RAW => (rest.to_vec(), Vec::new()),
         CLOSED => (patched(file(true), rest), appends().concat()),
@@ -142,7 +142,7 @@ fn placed(data: &[u8]) -> (Vec<u8>, Vec<Entry>) {
             continue;
         }
         let payload = piece.get(2..).unwrap_or(&[]);
-        values.insert(place.sequence, value::entries(payload).unwrap_or_default());
+        values.insert(place.sequence, value::entries(payload).map_while(Result::ok).collect::<Vec<_>>());
         bytes.extend(place.seal_payload(number(byte(piece, 1)), payload));
     }
     (bytes, values.into_values().flatten().collect())
