@@ -30,7 +30,7 @@ pub struct Changes {
     pub work: bool,
     /// There may be something to tell: owners of frames.
     pub news: bool,
-    /// A draft is whole and may be published, and where to.
+    /// The draft of a frame that makes records is whole and may be published, and where to.
     pub filled: Option<(Namespace, Namespace)>,
 }
 
@@ -136,7 +136,7 @@ impl Frames {
         let pixels = frame.round().is_some_and(|round| round.makes_pixels());
         let advanced = step != frame.round().map(|round| round.step().index);
         self.changes.work |= accepted && (pixels || advanced);
-        if accepted && pixels && advanced {
+        if accepted && pixels && advanced && frame.job().spec.levels > 0 {
             self.changes.filled = Some((draft, frame.job().namespace));
         }
         Ok(accepted)

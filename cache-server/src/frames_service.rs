@@ -121,9 +121,9 @@ impl Board {
         if job.spec.levels > 0 {
             self.store.label(label(&job, tenant.name(), namespace, None)).await?;
             self.store.label(label(&job, tenant.name(), draft, Some(namespace))).await?;
+            self.store.hold(draft);
         }
         let origin = Origin { tenant: tenant.clone(), base, draft };
-        self.store.hold(draft);
         let opened = self.change(|frames, _| frames.open(job, origin, |draft, step| self.mark(draft, step)));
         if opened.is_err() {
             self.store.release(&draft);
