@@ -110,6 +110,12 @@ impl Board {
         let job = Job::check(spec.ok_or(Refusal::Malformed(Malformed::Missing("spec")))?)?;
         let namespace = job.namespace;
         self.store.replica().belongs(&namespace, tenant.name())?;
+        if self.store.replica().is_draft(&namespace) {
+            return Err(Refusal::field(
+                "namespace",
+                "is the draft of a frame, expected that of a scene and its settings",
+            ));
+        }
         let base = if base.is_empty() {
             self.store.mark(&namespace)
         } else {
@@ -214,7 +220,8 @@ impl FramesTrait for FramesService {
 
     async fn renew(&self, request: Request<v1::RenewRequest>) -> Result<Response<v1::RenewResponse>, Status> {
         let worker = named(&tenant(&request), &request.get_ref().worker)?;
-        let leases = self.0.change(|frames, now| frames.renew(&worker, now));
+        let leases = request.into_inner().leases.into_iter().collect();
+        let leases = self.0.change(|frames, now| frames.renew(&worker, &leases, now));
         Ok(Response::new(v1::RenewResponse { leases }))
     }
 

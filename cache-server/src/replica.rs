@@ -295,6 +295,11 @@ impl Replica {
         self.kept.contains_key(namespace) || self.published.contains_key(namespace)
     }
 
+    /// Whether a namespace is the draft of a frame, published or not.
+    pub fn is_draft(&self, namespace: &Namespace) -> bool {
+        self.kept.get(namespace).is_some_and(|kept| kept.draft_of.is_some()) || self.published.contains_key(namespace)
+    }
+
     /// What a namespace is.
     pub fn label_of(&self, namespace: &Namespace) -> Option<&v1::Label> {
         self.kept.get(namespace)?.label.as_ref()
@@ -546,7 +551,7 @@ mod tests {
 
     #[test]
     fn a_draft_comes_back_only_if_there_is_room() {
-        let (mut replica, draft) = published(Limits { namespaces: 4, records: 6 });
+        let (mut replica, draft) = published(Limits { namespaces: 4, records: 6, ..Limits::default() });
         replica.insert(NAMESPACE, Tag::level(1), &[record(4, 0.0)]).expect("room");
         replica.hold(draft);
         assert_eq!((replica.mark(&draft).position, replica.census()), (0, (4, 2)));
@@ -554,7 +559,7 @@ mod tests {
 
     #[test]
     fn a_draft_published_to_what_was_given_up_begins_anew() {
-        let (mut replica, draft) = published(Limits { namespaces: 4, records: 8 });
+        let (mut replica, draft) = published(Limits { namespaces: 4, records: 8, ..Limits::default() });
         let label = v1::Label { namespace: NAMESPACE.0.to_vec().into(), ..Default::default() };
         replica.label(NAMESPACE, Some(draft), label).expect("room");
         let others = [11, 12, 13, 14, 15, 16].map(|id| record(id, 0.0));

@@ -5,7 +5,8 @@ use cache_core::{Irradiance, Namespace, RecordId, Tag};
 use cache_proto::convert::{self, Checked};
 use cache_proto::v1;
 use cache_server::journal::value;
-use cache_server::replica::{Limits, Replica};
+use cache_server::limits::Limits;
+use cache_server::replica::Replica;
 use glam::{Vec2, Vec3};
 use prost::Message as _;
 
@@ -14,7 +15,9 @@ use super::{byte, pieces};
 const STEPS_MAX: usize = 128;
 
 /// Small, so that every bound is reached.
-const LIMITS: Limits = Limits { namespaces: 4, records: 24 };
+fn limits() -> Limits {
+    Limits { namespaces: 4, records: 24, ..Limits::default() }
+}
 
 /// What happens to a replica.
 pub enum Step {
@@ -113,7 +116,7 @@ fn record(byte: u8) -> Irradiance {
 }
 
 fn bounded(steps: &[Step]) {
-    let mut replica = Replica::new(LIMITS);
+    let mut replica = Replica::new(limits());
     let mut holds = BTreeMap::<_, usize>::new();
     for step in steps {
         match step {
@@ -134,8 +137,8 @@ fn bounded(steps: &[Step]) {
         let (records, namespaces) = replica.census();
         let logs = replica.namespaces().filter_map(|n| replica.set(n)).map(|set| set.position() as u64).sum::<u64>();
         assert_eq!(records, logs);
-        assert!(records <= LIMITS.records as u64, "{records} records");
-        assert!(namespaces <= (LIMITS.namespaces + held) as u64, "{namespaces} namespaces, {held} of them held");
+        assert!(records <= limits().records as u64, "{records} records");
+        assert!(namespaces <= (limits().namespaces + held) as u64, "{namespaces} namespaces, {held} of them held");
     }
     let mut namespaces = replica.namespaces();
     assert!(namespaces.all(|n| replica.read(n, 0).is_ok_and(|first| first.is_none_or(|(count, _)| count > 0))));

@@ -8,6 +8,7 @@ use cache_proto::v1::frame_event::Event;
 use cache_server::access::Tenant;
 use cache_server::frame::{News, Origin};
 use cache_server::frames::Frames;
+use cache_server::limits::Limits;
 use cache_server::replica::Mark;
 use cache_server::spec::Job;
 use glam::{Vec2, Vec3};
@@ -42,7 +43,7 @@ struct Board {
 impl Default for Board {
     fn default() -> Self {
         let (leases, open, told) = Default::default();
-        let mut board = Self { frames: Frames::new(1), now: Duration::ZERO, leases, open, told };
+        let mut board = Self { frames: Frames::new(Limits::default(), 1), now: Duration::ZERO, leases, open, told };
         board.open(spec());
         board
     }
@@ -93,7 +94,7 @@ impl Board {
             2 => self.lease(&worker),
             // A lease completed with what it should bring, and sometimes more or less.
             3 => self.finish(bytes),
-            4 => drop(self.frames.renew(&worker, self.now)),
+            4 => drop(self.frames.renew(&worker, &self.leases.iter().map(|(_, lease)| lease.id).collect(), self.now)),
             5 => self.frames.leave(&worker),
             6 => {
                 let reason = String::from_utf8_lossy(bytes).repeat(1 + usize::from(byte(bytes, 2)));
