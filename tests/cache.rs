@@ -98,7 +98,7 @@ fn caches_filled_apart_unite_in_either_order_to_the_same() {
     let folder = Folder::new();
     let one = folder.write("one.vf", "rvu -vtv -vp 0.28 0.27 -0.8 -vd 0 0 1 -vu 0 1 0 -vh 40 -vv 35\n");
     let two = folder.write("two.vf", "rvu -vtv -vp 0.35 0.25 -0.7 -vd -0.1 0 1 -vu 0 1 0 -vh 40 -vv 35\n");
-    let name = |name| folder.name(name);
+    let name = |name: &str| folder.name(name);
     render(&folder, &one, &name("a"));
     render(&folder, &two, &name("b"));
     cache(&["merge", &name("a"), &name("b"), "-o", &name("ab")]);
