@@ -15,7 +15,8 @@ use cache_proto::v1::{Entry, entry};
 use cache_server::journal::Journal as _;
 use cache_server::journal::device::Sync;
 use cache_server::journal::disk::{Disk, FILE};
-use cache_server::replica::{Limits, Replica};
+use cache_server::limits::Limits;
+use cache_server::replica::Replica;
 use glam::{Vec2, Vec3};
 
 type Failed = Box<dyn std::error::Error>;
