@@ -70,7 +70,7 @@ impl Cache for CacheService {
             let digest = convert::digest(&digest).map_err(Refusal::from)?;
             self.store.replica().resume(&namespace, position, digest)
         };
-        let subscription = Subscription::new(&self.store, tenant, namespace, position);
+        let subscription = Subscription::new(&self.store, tenant, namespace, position)?;
         // Told before the stream begins, so that the client learns it from the call itself.
         self.store.replica().belongs(&namespace, subscription.tenant.name())?;
         self.store.replica().since(&namespace, position)?;
@@ -148,9 +148,10 @@ pub struct Subscription {
 }
 
 impl Subscription {
-    fn new(store: &Arc<Store>, tenant: Tenant, namespace: Namespace, position: u64) -> Self {
+    fn new(store: &Arc<Store>, tenant: Tenant, namespace: Namespace, position: u64) -> Result<Self, Refusal> {
         let grown = WatchStream::from_changes(store.grown().listen());
-        Self { store: store.count_subscriber(), grown, tenant, namespace, position, started: false, ended: false }
+        let store = store.count_subscriber()?;
+        Ok(Self { store, grown, tenant, namespace, position, started: false, ended: false })
     }
 
     fn read(&mut self) -> Result<Option<v1::SubscribeResponse>, Refusal> {

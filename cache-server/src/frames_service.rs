@@ -20,6 +20,7 @@ use crate::bell::Bell;
 use crate::clock::Clock;
 use crate::frame::{News, Origin};
 use crate::frames::{Changes, Frames};
+use crate::limits::Limits;
 use crate::refusal::{Refusal, same_version};
 use crate::replica::Mark;
 use crate::spec::{self, Job};
@@ -45,8 +46,14 @@ pub struct Board {
 
 impl Board {
     /// A board without frames; see [`Frames::new`] for `first`.
-    pub fn new(store: Arc<Store>, clock: Clock, first: u64) -> Self {
-        Self { frames: Mutex::new(Frames::new(first)), store, clock, work: Bell::default(), news: Bell::default() }
+    pub fn new(store: Arc<Store>, clock: Clock, limits: Limits, first: u64) -> Self {
+        Self {
+            frames: Mutex::new(Frames::new(limits, first)),
+            store,
+            clock,
+            work: Bell::default(),
+            news: Bell::default(),
+        }
     }
 
     /// Takes back leases whose deadline has come. To be called a few times a second.
@@ -64,6 +71,12 @@ impl Board {
     pub fn census(&self) -> (u64, u64) {
         let frames = lock(&self.frames);
         (frames.frames() as u64, frames.workers() as u64)
+    }
+
+    /// How many leases are held, and how old the oldest is.
+    pub fn leases(&self) -> (u64, Duration) {
+        let (held, since) = lock(&self.frames).leases();
+        (held as u64, since.map_or(Duration::ZERO, |since| self.clock.now().saturating_sub(since)))
     }
 
     /// One transition; then wakes whom it concerns.

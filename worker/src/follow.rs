@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use cache_core::{Irradiance, Namespace, RecordId, Tag};
 use cache_proto::{convert, v1};
-use tokio::sync::watch;
+use tokio::sync::{Notify, watch};
 use tokio::task::JoinHandle;
 use tonic::{Code, Status};
 use tracing::{debug, info, warn};
@@ -20,12 +20,16 @@ use crate::threads::{lock, off_thread};
 /// How often someone who waits for records looks whether that is still of use.
 const LOOK: Duration = Duration::from_millis(200);
 
+/// How long a log that has come to its end is left alone, unless someone waits for its records.
+const REST: Duration = Duration::from_secs(30);
+
 /// A replica and the task that feeds it. Dropping it ends the subscription.
 pub struct Follower {
     held: Arc<Mutex<Held>>,
     reached: watch::Receiver<Reached>,
     /// The last epoch whose log is not to be followed any more.
     left: watch::Sender<u64>,
+    wanted: Arc<Notify>,
     received: Arc<AtomicU64>,
     task: JoinHandle<()>,
 }
@@ -58,10 +62,17 @@ impl Follower {
         let held = Arc::new(Mutex::new(Held { replica: Replica::new(namespace), aside: None }));
         let (sender, reached) = watch::channel(Reached { epoch: 1, ..Reached::default() });
         let (left, leaving) = watch::channel(0);
-        let received = Arc::new(AtomicU64::new(0));
-        let feed =
-            Feed { cache, namespace, held: held.clone(), reached: sender, left: leaving, received: received.clone() };
-        Self { held, reached, left, received, task: tokio::spawn(feed.run()) }
+        let (wanted, received) = (Arc::new(Notify::new()), Arc::new(AtomicU64::new(0)));
+        let feed = Feed {
+            cache,
+            namespace,
+            held: held.clone(),
+            reached: sender,
+            left: leaving,
+            wanted: wanted.clone(),
+            received: received.clone(),
+        };
+        Self { held, reached, left, wanted, received, task: tokio::spawn(feed.run()) }
     }
 
     /// Bytes of records received since the last call.
@@ -89,6 +100,7 @@ impl Follower {
             if dropped() {
                 return Ok(false);
             }
+            self.wanted.notify_one();
             // Ran out of time, or the subscription ended for good: look again, at the same pace.
             if let Ok(Err(_)) = tokio::time::timeout(LOOK, here.changed()).await {
                 tokio::time::sleep(LOOK).await;
@@ -126,6 +138,7 @@ struct Feed {
     held: Arc<Mutex<Held>>,
     reached: watch::Sender<Reached>,
     left: watch::Receiver<u64>,
+    wanted: Arc<Notify>,
     received: Arc<AtomicU64>,
 }
 
@@ -140,6 +153,11 @@ impl Feed {
                 Ok(()) => debug!("the subscription ended"),
                 Err(status) if matches!(status.code(), Code::PermissionDenied | Code::Unauthenticated) => {
                     return self.reached.send_modify(|reached| reached.refused = Some(status));
+                }
+                Err(status) if status.code() == Code::NotFound => {
+                    // A published draft: nothing comes any more, unless a frame fills it again or the server is lost.
+                    debug!("{status}");
+                    drop(tokio::time::timeout(REST, self.wanted.notified()).await);
                 }
                 Err(status) => debug!("subscription ended: {status}"),
             }
