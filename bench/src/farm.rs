@@ -58,11 +58,12 @@ pub fn run(args: &FarmArgs) -> Result<(), Box<dyn Error>> {
     );
     let mut report = Report::begin(&command);
     report.line(&format!(
-        "{:>7} {:>8} {:>8} {:>21} {:>8} {:>6} {:>6} {:>9} {:>16} {:>8} {:>8} {:>8}",
+        "{:>7} {:>8} {:>8} {:>21} {:>8} {:>8} {:>6} {:>6} {:>9} {:>16} {:>8} {:>8} {:>8}",
         "workers",
         "wall s",
         "ideal s",
         "idle % lvl2/lvl1/pix",
+        "leases",
         "records",
         "twice",
         "lost",
@@ -73,8 +74,8 @@ pub fn run(args: &FarmArgs) -> Result<(), Box<dyn Error>> {
         "workers"
     ));
     report.line(&format!(
-        "{:>7} {:>8} {:>8} {:>21} {:>8} {:>6} {:>6} {:>9} {:>16} {:>8} {:>8} {:>8}",
-        "", "", "", "", "", "made", "leases", "a worker", "p50 / p99", "CPU s", "peak MB", "CPU s"
+        "{:>7} {:>8} {:>8} {:>21} {:>8} {:>8} {:>6} {:>6} {:>9} {:>16} {:>8} {:>8} {:>8}",
+        "", "", "", "", "", "", "made", "leases", "a worker", "p50 / p99", "CPU s", "peak MB", "CPU s"
     ));
     let mut runs = Vec::new();
     for &workers in &args.workers {
@@ -100,6 +101,7 @@ struct Run {
     busy: BTreeMap<&'static str, f64>,
     done: v1::FrameDone,
     made: u64,
+    leases: u64,
     /// Milliseconds from the end of a gather until every replica has the record.
     visible: [f64; 2],
     /// Bytes of records each worker received.
@@ -125,11 +127,12 @@ impl std::fmt::Display for Run {
         let [p50, p99] = self.visible;
         write!(
             f,
-            "{:7} {:8.1} {:8.1} {:>21} {:8} {:6} {:6} {:9.2} {:>16} {:8.1} {:8.0} {:8.1}",
+            "{:7} {:8.1} {:8.1} {:>21} {:8} {:8} {:6} {:6} {:9.2} {:>16} {:8.1} {:8.0} {:8.1}",
             self.workers,
             self.wall,
             self.ideal(),
             format!("{a:.0} / {b:.0} / {c:.0}"),
+            self.leases,
             self.done.records,
             self.made - self.done.records,
             self.done.leases_lost,
@@ -144,6 +147,7 @@ impl std::fmt::Display for Run {
 
 fn frame(args: &FarmArgs, workers: u32) -> Result<Run, Box<dyn Error>> {
     watch().made.store(0, Ordering::Relaxed);
+    watch().leases.store(0, Ordering::Relaxed);
     lock(&watch().replicas).clear();
     lock(&watch().watched).clear();
     let mut host = Host::start(Kind::Memory, 0, 1)?;
@@ -202,6 +206,7 @@ fn frame(args: &FarmArgs, workers: u32) -> Result<Run, Box<dyn Error>> {
         phases,
         busy: PHASES.map(|phase| (phase, count(&format!("cpu_seconds.{phase}")))).into(),
         made: watch().made.load(Ordering::Relaxed),
+        leases: watch().leases.load(Ordering::Relaxed),
         visible: [0.5, 0.99].map(|q| quantile(&mut visible, q)),
         received: count("bytes.subscribed") / f64::from(workers),
         done,

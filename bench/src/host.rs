@@ -121,10 +121,11 @@ fn socket(folder: &Path) -> PathBuf {
 pub fn usage() -> Result<Usage, nix::Error> {
     let usage = getrusage(UsageWho::RUSAGE_SELF)?;
     let seconds = |time: nix::sys::time::TimeVal| time.tv_sec() as f64 + time.tv_usec() as f64 * 1e-6;
-    // In kilobytes, but on macOS.
-    let unit = if cfg!(target_os = "macos") { 1.0 } else { 1024.0 };
     let cpu = seconds(usage.user_time()) + seconds(usage.system_time());
-    Ok(Usage { cpu, peak: usage.max_rss() as f64 * unit })
+    // Linux counts the parent's memory into `max_rss` from before the program was its own.
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:")?.trim().strip_suffix(" kB")?.parse().ok());
+    Ok(Usage { cpu, peak: peak.map_or(usage.max_rss() as f64, |kilobytes: f64| kilobytes * 1024.0) })
 }
 
 /// The server's side: serves until its stdin ends, and answers each line there with its [`Usage`].

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
-use cache_core::rounds::{RANKS, Step, look, rank};
+use cache_core::rounds::{PATTERN, Step, look, rank};
 use cache_core::{RecordId, Tag};
 use cache_proto::{convert, v1};
 use worker::frame::CHANNELS;
@@ -18,9 +18,8 @@ use worker::task::Done;
 
 use crate::records;
 
-/// Edge of a tile in pixels, and of the pattern of ranks.
+/// Edge of a tile in pixels.
 const TILE: u32 = 16;
-const PATTERN: u32 = 64;
 
 /// Share of candidates uncovered at rank r of the first pass: SHARE (r + 1)^FALL, at most all.
 const SHARE: f32 = 1.1;
@@ -36,6 +35,8 @@ const PIXEL: f32 = 20.0;
 /// What all workers of this process tell the benchmark.
 #[derive(Default)]
 pub struct Watch {
+    /// Leases worked on.
+    pub leases: AtomicU64,
     /// Records made, those made twice included.
     pub made: AtomicU64,
     /// How each worker finds what its replica holds.
@@ -103,6 +104,7 @@ impl Job for Pretended {
 
     async fn run(self: Arc<Self>, work: Work) -> Result<Option<Done>, String> {
         self.known.get_or_init(|| lock(&watch().replicas).push(work.known.clone()));
+        watch().leases.fetch_add(1, Ordering::Relaxed);
         let mut done = Done::default();
         let mut micros = 0.0;
         for tile in work.tiles.start..work.tiles.end.min(self.tiles()) {
@@ -111,7 +113,7 @@ impl Job for Pretended {
                     micros += self.fill(tile, level, pass, ranks, work.step.index, &mut done);
                 }
                 Step::Pixels => {
-                    let pixels = self.pixels(tile).count();
+                    let pixels = self.pixels(tile);
                     micros += PIXEL * pixels as f32;
                     let pixels = vec![0x3f; pixels * CHANNELS * 4].into();
                     done.tiles.push(v1::FrameTile { tile, pixels });
@@ -135,11 +137,17 @@ impl Pretended {
         self.width.div_ceil(TILE) * self.height.div_ceil(TILE)
     }
 
-    fn pixels(&self, tile: u32) -> impl Iterator<Item = [u32; 2]> {
+    /// Where a tile stands among the others.
+    fn place(&self, tile: u32) -> [u32; 2] {
         let columns = self.width.div_ceil(TILE);
-        let (x, y) = (tile % columns * TILE, tile / columns * TILE);
-        let (right, bottom) = ((x + TILE).min(self.width), (y + TILE).min(self.height));
-        (y..bottom).flat_map(move |y| (x..right).map(move |x| [x, y]))
+        [tile % columns, tile / columns]
+    }
+
+    /// How many pixels a tile has; those at the edges are cut.
+    fn pixels(&self, tile: u32) -> usize {
+        let [column, row] = self.place(tile);
+        let span = |at: u32, end: u32| TILE.min(end - at * TILE) as usize;
+        span(column, self.width) * span(row, self.height)
     }
 
     /// Gathers what is uncovered in a tile; says how long that takes, microseconds.
@@ -147,14 +155,17 @@ impl Pretended {
         let mut micros = 0.0;
         // Few tiles need much, most need little.
         let need = 0.25 * 16f32.powf(uniform(&[tile, level])) * 0.74;
-        for [x, y] in self.pixels(tile) {
-            let rank = rank(x % PATTERN, y % PATTERN);
-            if !ranks.contains(&rank) {
+        let [column, row] = self.place(tile);
+        let pixels = pixels_by_rank(column, row);
+        let [from, to] = [ranks.start, ranks.end].map(|end| pixels.partition_point(|[rank, ..]| *rank < end));
+        for [rank, x, y] in &pixels[from..to] {
+            let [x, y] = [column * TILE + x, row * TILE + y];
+            if x >= self.width || y >= self.height {
                 continue;
             }
             micros += TEST;
             let share = match pass {
-                0 => SHARE * ((rank + 1) as f32).powf(FALL) * need,
+                0 => SHARE * ((*rank + 1) as f32).powf(FALL) * need,
                 pass if look(level, pass) == pass => LATER * need / pass as f32,
                 _ => 0.0,
             };
@@ -200,4 +211,17 @@ pub fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
-const _: () = assert!(RANKS == PATTERN * PATTERN);
+/// The pixels of a tile of each place in the pattern, lowest ranks first.
+fn pixels_by_rank(column: u32, row: u32) -> &'static [[u32; 3]] {
+    static TILES: OnceLock<Vec<Vec<[u32; 3]>>> = OnceLock::new();
+    const PERIOD: u32 = PATTERN / TILE;
+    let tile = |at: u32| {
+        let (left, top) = (at % PERIOD * TILE, at / PERIOD * TILE);
+        let pixels = (0..TILE * TILE).map(|i| [i % TILE, i / TILE]);
+        let mut ranked: Vec<_> = pixels.map(|[x, y]| [rank(left + x, top + y), x, y]).collect();
+        ranked.sort_unstable();
+        ranked
+    };
+    let tiles = TILES.get_or_init(|| (0..PERIOD * PERIOD).map(tile).collect());
+    &tiles[(row % PERIOD * PERIOD + column % PERIOD) as usize]
+}

@@ -138,6 +138,11 @@ impl Frame {
         Some(v1::Lease { id: lease, frame: self.id, step, tile_from: tiles.start, tile_to: tiles.end })
     }
 
+    /// Whether there is something to lease.
+    pub fn has_work(&self) -> bool {
+        self.round.as_ref().is_some_and(|round| round.pending_tiles() > 0) && self.room() > 0
+    }
+
     /// Most tiles one lease may have now: what the owner can still take, if they are pixels.
     fn room(&self) -> u32 {
         let Some(round) = self.round.as_ref().filter(|round| round.makes_pixels()) else { return u32::MAX };
@@ -190,7 +195,7 @@ impl Frame {
         self.round = self.plan.next(gathered).map(|step| {
             let mark = mark(self.steps);
             let step = convert::step(self.steps, &step, mark.position, mark.sum.digest);
-            Round::new(step, self.job.tiles)
+            Round::new(step, &self.job)
         });
         if let Some(round) = &self.round {
             self.steps += 1;
