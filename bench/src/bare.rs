@@ -1,7 +1,8 @@
-//! The cache service with nothing behind it: the same messages over the same transport, counted, relayed and forgotten.
+//! The cache service with nothing behind it: the same messages over the same transport, relayed and forgotten, or kept as they came.
 //! What the real one is measured against.
 
 use std::pin::Pin;
+use std::sync::Mutex;
 
 use cache_proto::v1::cache_server::Cache;
 use cache_proto::v1::{
@@ -13,6 +14,8 @@ use tokio_stream::wrappers::BroadcastStream;
 use tokio_stream::{Stream, StreamExt as _};
 use tonic::{Request, Response, Status, Streaming};
 
+use crate::work::lock;
+
 /// A subscription from here gets what is inserted from now on; one from 0 the batches that were prepared.
 pub const LIVE: u64 = u64::MAX;
 
@@ -22,13 +25,15 @@ const LAG: usize = 1024;
 /// The service.
 pub struct Bare {
     prepared: Vec<RecordBatch>,
+    /// What came, if that is to be kept.
+    kept: Option<Mutex<Vec<RecordBatch>>>,
     live: broadcast::Sender<RecordBatch>,
 }
 
 impl Bare {
-    /// A service with `prepared` batches to send.
-    pub fn new(prepared: Vec<RecordBatch>) -> Self {
-        Self { prepared, live: broadcast::Sender::new(LAG) }
+    /// A service with `prepared` batches to send, that keeps the messages it gets or forgets them.
+    pub fn new(prepared: Vec<RecordBatch>, keeps: bool) -> Self {
+        Self { prepared, kept: keeps.then(Mutex::default), live: broadcast::Sender::new(LAG) }
     }
 }
 
@@ -44,6 +49,9 @@ impl Cache for Bare {
         while let Some(request) = batches.message().await? {
             let batch = request.batch.ok_or_else(|| Status::invalid_argument("no batch"))?;
             position += 1;
+            if let Some(kept) = &self.kept {
+                lock(kept).push(batch.clone());
+            }
             // Nobody may listen.
             let _ = self.live.send(batch);
         }

@@ -24,8 +24,10 @@ use crate::records;
 /// What is behind the socket.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, clap::ValueEnum)]
 pub enum Kind {
-    /// Nothing: the bare stream.
+    /// Nothing: the bare stream, its messages forgotten.
     Bare,
+    /// Nothing, but the messages are kept in memory as they came.
+    Keep,
     /// The service, records in memory only.
     Memory,
     /// The service, records durable in the kernel's page cache.
@@ -142,8 +144,9 @@ pub fn serve(args: &HostArgs) -> Result<(), Box<dyn Error>> {
     let path = socket(&args.folder);
     let serving: std::pin::Pin<Box<dyn Future<Output = Result<(), String>> + Send>> = match journal(args)? {
         None => {
+            let keeps = args.kind == Kind::Keep;
             let incoming = UnixListenerStream::new(UnixListener::bind(&path)?);
-            let bare = CacheServer::new(Bare::new(prepared)).max_decoding_message_size(CACHE_MESSAGE_MAX);
+            let bare = CacheServer::new(Bare::new(prepared, keeps)).max_decoding_message_size(CACHE_MESSAGE_MAX);
             let server = Server::builder()
                 .initial_stream_window_size(STREAM_WINDOW)
                 .initial_connection_window_size(CONNECTION_WINDOW)
@@ -175,7 +178,7 @@ fn journal(args: &HostArgs) -> Result<Option<Box<dyn Journal>>, Box<dyn Error>> 
     let disk =
         |sync| Disk::open(&args.folder.join("journal"), sync).map(|(disk, _)| Box::new(disk) as Box<dyn Journal>);
     Ok(match args.kind {
-        Kind::Bare => None,
+        Kind::Bare | Kind::Keep => None,
         Kind::Memory => Some(Box::new(cache_server::journal::Nowhere)),
         Kind::Page => Some(disk(Sync::PageCache).map_err(|e| e.to_string())?),
         Kind::Device => Some(disk(Sync::Device).map_err(|e| e.to_string())?),

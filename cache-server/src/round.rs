@@ -1,6 +1,6 @@
 //! The tiles of one step: each is pending, leased to one worker, or done. No I/O; time is passed in.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::sync::Arc;
 use std::time::Duration;
@@ -38,6 +38,8 @@ pub struct Round {
     tiles: u32,
     empty: Empty,
     gathered: u64,
+    /// Time from grant to end of the leases that are done, all together.
+    spent: Duration,
 }
 
 /// Which tiles have nothing to do: no pixel whose rank the step tests lies in them.
@@ -84,6 +86,7 @@ impl Round {
             tiles,
             empty,
             gathered: 0,
+            spent: Duration::ZERO,
         }
     }
 
@@ -127,6 +130,13 @@ impl Round {
         self.gathered
     }
 
+    /// How many tiles take one worker that long, as far as those done tell; 0 if they tell nothing.
+    pub fn tiles_in(&self, time: Duration) -> u32 {
+        let tiles = f64::from(self.done_tiles()) * time.as_secs_f64() / self.spent.as_secs_f64();
+        // Infinity and what is more than all saturate.
+        if self.spent.is_zero() { 0 } else { tiles as u32 }
+    }
+
     /// Leases up to `most` of the lowest pending tiles, contiguous, and empty ones behind them; more if all those are
     /// empty, since a lease costs more than looking at nothing. `None` when none is pending.
     pub fn grant(
@@ -168,18 +178,20 @@ impl Round {
         self.leases.iter().filter(move |(_, held)| &*held.worker == worker).map(|(&lease, _)| lease)
     }
 
-    /// Moves the deadline of all leases a worker holds.
-    pub fn renew(&mut self, worker: &str, deadline: Duration) {
-        for held in self.leases.values_mut().filter(|held| &*held.worker == worker) {
+    /// Moves the deadline of those of the leases that a worker holds.
+    pub fn renew(&mut self, worker: &str, leases: &BTreeSet<u64>, deadline: Duration) {
+        let named = self.leases.iter_mut().filter(|(id, held)| leases.contains(id) && &*held.worker == worker);
+        for (_, held) in named {
             held.deadline = deadline;
         }
     }
 
     /// Ends a lease whose tiles are done. Unknown leases change nothing.
-    pub fn complete(&mut self, lease: u64, gathered: u64) {
+    pub fn complete(&mut self, lease: u64, gathered: u64, now: Duration) {
         if let Some(held) = self.leases.remove(&lease) {
             self.leased_tiles -= held.tiles.end - held.tiles.start;
             self.gathered += gathered;
+            self.spent += now.saturating_sub(held.since);
         }
     }
 
