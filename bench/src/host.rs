@@ -13,10 +13,10 @@ use cache_server::serve::{CACHE_MESSAGE_MAX, CONNECTION_WINDOW, STREAM_WINDOW};
 use cache_server::{Config, Listen};
 use nix::sys::resource::{UsageWho, getrusage};
 use tempfile::TempDir;
-use tokio::net::UnixListener;
+use tokio::net::{UnixListener, UnixStream};
 use tokio_stream::wrappers::UnixListenerStream;
-use tonic::transport::{Channel, Server};
-use worker::client::{Address, connect};
+use tonic::transport::Server;
+use worker::client::{Line, connect_with};
 
 use crate::bare::Bare;
 use crate::records;
@@ -87,8 +87,9 @@ impl Host {
     }
 
     /// A new connection.
-    pub fn connect(&self) -> Channel {
-        connect(&Address::Unix(socket(self.folder.path())))
+    pub fn connect(&self) -> Line {
+        let path = socket(self.folder.path());
+        connect_with(move || UnixStream::connect(path.clone()))
     }
 
     /// What it has used so far.

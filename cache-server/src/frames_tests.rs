@@ -245,6 +245,16 @@ fn open(frames: &mut Frames, tiles: u32, levels: u32) -> u64 {
 }
 
 fn complete(frames: &mut Frames, worker: &str, lease: &v1::Lease, bytes: usize) -> Result<bool, Refusal> {
+    complete_at(frames, worker, lease, bytes, Duration::ZERO)
+}
+
+fn complete_at(
+    frames: &mut Frames,
+    worker: &str,
+    lease: &v1::Lease,
+    bytes: usize,
+    now: Duration,
+) -> Result<bool, Refusal> {
     let tile = |tile| v1::FrameTile { tile, pixels: vec![0; bytes].into() };
     let request = v1::CompleteRequest {
         worker: worker.into(),
@@ -253,7 +263,7 @@ fn complete(frames: &mut Frames, worker: &str, lease: &v1::Lease, bytes: usize) 
         tiles: (lease.tile_from..lease.tile_to).map(tile).collect(),
         ..Default::default()
     };
-    frames.complete(request, Duration::ZERO, |_, _| Mark::default())
+    frames.complete(request, now, |_, _| Mark::default())
 }
 
 #[test]
@@ -267,6 +277,19 @@ fn leases_shrink_as_work_runs_out_and_lost_tiles_are_given_first() {
     assert!(frames.take_changes().work);
     assert_eq!(range(lease(&mut frames, "b", 0)), Some(0..14));
     assert_eq!(range(lease(&mut frames, "b", 0)), Some(14..16));
+}
+
+#[test]
+fn leases_of_quick_tiles_are_larger() {
+    for (milliseconds, next) in [(1, 48), (40, 12), (16_000, 12)] {
+        let mut frames = Frames::new(Limits::default(), 1);
+        open(&mut frames, 64, 0);
+        let first = lease(&mut frames, "a", 0).expect("work");
+        let now = Duration::from_millis(milliseconds);
+        assert!(complete_at(&mut frames, "a", &first, 4 * 4 * 3, now).expect("sound"));
+        let second = lease(&mut frames, "a", 16).expect("work");
+        assert_eq!((first.tile_to, second.tile_to - second.tile_from), (16, next), "{milliseconds} ms");
+    }
 }
 
 #[test]
