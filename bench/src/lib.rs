@@ -1,5 +1,24 @@
-//! The charts: speed against accuracy, on scenes with trusted references.
+//! The charts: speed against accuracy, the service against the bare stream under it, farms that are simulated.
 //!
 //! - [`judge`]: scenes with references, and the measure pictures of them are held to; the tests use it too.
+//! - [`pictures`]: speed against accuracy.
+//! - [`records`]: records made up, of real size.
+//! - [`bare`]: the cache service with nothing behind it.
+//! - [`host`]: a server in a process of its own.
+//! - [`service`]: records in and out, queries and latency, as ratios to the bare stream.
+//! - [`work`]: what a simulated worker computes.
+//! - [`farm`]: one frame by farms of many sizes.
+//! - [`report`]: tables and charts.
 
 pub mod judge;
+pub mod pictures;
+
+pub mod bare;
+pub mod host;
+pub mod records;
+pub mod service;
+
+pub mod farm;
+pub mod work;
+
+pub mod report;

@@ -1,65 +1,39 @@
-//! Speed against accuracy: every method at several settings, on the scenes with references, one thread.
-//!
-//! `cargo run --release -p ambience-bench [EDGE] [SCENE.DEPTH ...]` prints one line a setting; without arguments it takes
-//! the scenes of the README at 128 x 128. Larger pictures (EDGE a multiple of 128) are averaged down before they are
-//! judged. Seconds are those of one thread, filling and pixels together, loading apart.
+//! The benchmarks. Without a command: speed against accuracy.
 
-use std::time::Instant;
+use std::error::Error;
 
-use ambience_bench::judge::{SIZE, judge, load, reduce, reference, settings};
-use worker::frame::{CHANNELS, Frame};
-use worker::settings::{Method, Settings};
-use worker::solo::{self, Order};
+use ambience_bench::host::HostArgs;
+use ambience_bench::{farm, host, pictures, service};
+use clap::{Parser, Subcommand};
 
-const SCENES: [&str; 5] = ["cornell.full", "stairs.full", "leak.full", "sphere-plane.one", "glossy-floor.full"];
+/// Speed against accuracy: every method at several settings, on the scenes with references.
+#[derive(Parser)]
+#[command(args_conflicts_with_subcommands = true)]
+struct Args {
+    #[command(subcommand)]
+    command: Option<Command>,
+    /// Edge of the pictures, a multiple of 128, and scenes as SCENE.DEPTH [default: 128, those of the README]
+    #[arg(value_name = "EDGE | SCENE.DEPTH")]
+    pictures: Vec<String>,
+}
 
-fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let mut asked: Vec<String> = std::env::args().skip(1).collect();
-    let edge = match asked.first().and_then(|first| first.parse::<u32>().ok()) {
-        Some(edge) if edge > 0 && (edge as usize).is_multiple_of(SIZE) => edge,
-        Some(edge) => return Err(format!("{edge}: expected a multiple of {SIZE}").into()),
-        None => SIZE as u32,
-    };
-    asked.retain(|a| a.parse::<u32>().is_err());
-    let names: Vec<&str> = if asked.is_empty() { SCENES.to_vec() } else { asked.iter().map(String::as_str).collect() };
-    println!("{edge}x{edge}, one thread; errors relative to the reference's mean");
-    println!(
-        "{:20} {:28} {:>8} {:>8} {:>7} {:>7} {:>7}",
-        "scene", "settings", "seconds", "records", "RMSE", "bias", "worst"
-    );
-    let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
-    for name in names {
-        let (scene, depth) = name.split_once('.').ok_or("expected SCENE.DEPTH, for instance cornell.full")?;
-        let truth = reference(name);
-        let (scene, camera) = load(&format!("{scene}.glb"));
-        let base = Settings { width: edge, height: edge, ..settings(camera, depth) };
-        let cached = |rays, spp, a| Settings { rays, spp, a, ..base.clone() };
-        let path = |spp| Settings { method: Method::Path, spp, ..base.clone() };
-        let ladder = [cached(512, 16, 0.4), base.clone(), cached(8192, 128, 0.2), path(16), path(64), path(256)];
-        for settings in ladder {
-            let label = match settings.method {
-                Method::Path => format!("path --spp {}", settings.spp),
-                Method::Irradiance => format!("--rays {} --a {} --spp {}", settings.rays, settings.a, settings.spp),
-            };
-            let frame = Frame::new(scene.clone(), settings);
-            let start = Instant::now();
-            let (levels, pixels) = one_thread.install(|| {
-                let levels = solo::fill(&frame, Order::Rounds);
-                let pixels = solo::pixels(&frame, &levels).0;
-                (levels, pixels)
-            });
-            let seconds = start.elapsed().as_secs_f64();
-            let records: usize = levels.iter().map(|l| l.len()).sum();
-            let image: Vec<_> =
-                pixels.chunks_exact(CHANNELS).map(|p| [p[0].into(), p[1].into(), p[2].into()]).collect();
-            let v = judge(&reduce(&image), &truth);
-            println!(
-                "{name:20} {label:28} {seconds:8.2} {records:8} {:6.2}% {:+6.2}% {:6.2}%",
-                100.0 * v.rmse,
-                100.0 * v.bias,
-                100.0 * v.worst
-            );
-        }
+#[derive(Subcommand)]
+enum Command {
+    /// The cache service against the bare stream under it
+    Service(service::ServiceArgs),
+    /// One frame by simulated farms of many sizes
+    Farm(farm::FarmArgs),
+    /// The server's side of the other two
+    #[command(hide = true)]
+    Host(HostArgs),
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let Args { command, pictures } = Args::parse();
+    match command {
+        None => pictures::run(pictures),
+        Some(Command::Service(args)) => service::run(&args),
+        Some(Command::Farm(args)) => farm::run(&args),
+        Some(Command::Host(args)) => host::serve(&args),
     }
-    Ok(())
 }

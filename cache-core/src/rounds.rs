@@ -9,8 +9,10 @@
 
 use std::ops::Range;
 
+/// Edge of the pattern in pixels.
+pub const PATTERN: u32 = 1 << RANK_BITS;
 /// Ranks in the pattern.
-pub const RANKS: u32 = 1 << (2 * RANK_BITS);
+pub const RANKS: u32 = PATTERN * PATTERN;
 const RANK_BITS: u32 = 6;
 
 /// Each round of the first pass ends at this many times the ranks tested before it.

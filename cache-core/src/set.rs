@@ -1,7 +1,10 @@
 //! Id to record: the grow-only set every replica holds. Union is the only merge: idempotent, commutative, associative.
 
-use std::collections::hash_map::Entry;
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
+use std::hash::BuildHasher as _;
+
+use hashbrown::DefaultHashBuilder;
+use hashbrown::hash_table::{Entry, HashTable};
 
 use crate::cached::Cached;
 use crate::id::{Digest, RecordId};
@@ -67,7 +70,7 @@ pub enum Inserted {
 #[derive(Clone, Debug)]
 pub struct RecordSet<C> {
     log: Vec<(Tag, C)>,
-    index: HashMap<RecordId, usize>,
+    index: Index,
     /// What each step gathered.
     steps: BTreeMap<u32, Sum>,
     /// Positions whose record took the place of an earlier one.
@@ -75,52 +78,92 @@ pub struct RecordSet<C> {
     conflicts: u64,
 }
 
+/// Where the record of each id stands in the log.
+#[derive(Clone, Debug, Default)]
+struct Index {
+    slots: HashTable<Slot>,
+    /// Keyed: ids are hashes already, but a peer may choose its own.
+    hasher: DefaultHashBuilder,
+}
+
+/// A position, and the hash of the id that stands there: growing the table does not read the log, and few other ids do.
+#[derive(Clone, Copy, Debug)]
+struct Slot {
+    hash: u32,
+    at: u32,
+}
+
+impl Index {
+    fn hash(&self, id: RecordId) -> u32 {
+        self.hasher.hash_one(id.0) as u32
+    }
+
+    fn position<C: Cached>(&self, log: &[(Tag, C)], id: RecordId) -> Option<usize> {
+        let hash = self.hash(id);
+        let slot = self.slots.find(spread(hash), |slot| slot.hash == hash && log[slot.at as usize].1.id() == id);
+        slot.map(|slot| slot.at as usize)
+    }
+
+    fn entry<C: Cached>(&mut self, log: &[(Tag, C)], id: RecordId) -> (Slot, Entry<'_, Slot>) {
+        let at = u32::try_from(log.len()).expect("no memory holds a log of 2^32 records");
+        let hash = self.hash(id);
+        let same = |slot: &Slot| slot.hash == hash && log[slot.at as usize].1.id() == id;
+        (Slot { hash, at }, self.slots.entry(spread(hash), same, |slot| spread(slot.hash)))
+    }
+}
+
+/// The table looks at the lowest and the highest bits.
+fn spread(hash: u32) -> u64 {
+    u64::from(hash).wrapping_mul(0x9E37_79B9_7F4A_7C15)
+}
+
 impl<C> Default for RecordSet<C> {
     fn default() -> Self {
-        Self { log: Vec::new(), index: HashMap::new(), steps: BTreeMap::new(), replaced: BTreeSet::new(), conflicts: 0 }
+        let (log, index) = (Vec::new(), Index::default());
+        Self { log, index, steps: BTreeMap::new(), replaced: BTreeSet::new(), conflicts: 0 }
     }
 }
 
 impl<C: Cached> RecordSet<C> {
     /// Unites with one record.
     pub fn insert(&mut self, tag: Tag, record: C) -> Inserted {
-        let (id, position) = (record.id(), self.log.len());
-        match self.index.entry(id) {
+        let id = record.id();
+        let (new, slot) = self.index.entry(&self.log, id);
+        let mut slot = match slot {
             Entry::Vacant(slot) => {
-                slot.insert(position);
+                slot.insert(new);
                 self.steps.entry(tag.step).or_default().add(id);
                 self.log.push((tag, record));
-                Inserted::Added
+                return Inserted::Added;
             }
-            Entry::Occupied(mut slot) => {
-                let (known, held) = &self.log[*slot.get()];
-                let order = (tag, bytes(&record)).cmp(&(*known, bytes(held)));
-                if order.is_ne() {
-                    self.conflicts += 1;
-                }
-                if order.is_lt() {
-                    if let Some(sum) = self.steps.get_mut(&known.step) {
-                        sum.remove(id);
-                    }
-                    self.steps.entry(tag.step).or_default().add(id);
-                    slot.insert(position);
-                    self.replaced.insert(position);
-                    self.log.push((tag, record));
-                    return Inserted::Replaced;
-                }
-                Inserted::Known
-            }
+            Entry::Occupied(slot) => slot,
+        };
+        let (known, held) = &self.log[slot.get().at as usize];
+        let order = (tag, bytes(&record)).cmp(&(*known, bytes(held)));
+        if order.is_ne() {
+            self.conflicts += 1;
         }
+        if order.is_ge() {
+            return Inserted::Known;
+        }
+        if let Some(sum) = self.steps.get_mut(&known.step) {
+            sum.remove(id);
+        }
+        self.steps.entry(tag.step).or_default().add(id);
+        *slot.get_mut() = new;
+        self.replaced.insert(new.at as usize);
+        self.log.push((tag, record));
+        Inserted::Replaced
     }
 
     /// Records in the set.
     pub fn len(&self) -> usize {
-        self.index.len()
+        self.index.slots.len()
     }
 
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
-        self.index.is_empty()
+        self.index.slots.is_empty()
     }
 
     /// Length of the log: where the next record will stand.
@@ -135,7 +178,7 @@ impl<C: Cached> RecordSet<C> {
 
     /// Where the record of an id stands in the log.
     pub fn position_of(&self, id: RecordId) -> Option<usize> {
-        self.index.get(&id).copied()
+        self.index.position(&self.log, id)
     }
 
     /// The log from a position on, in order of arrival. Empty past the end.
@@ -145,11 +188,10 @@ impl<C: Cached> RecordSet<C> {
 
     /// The records of one level, in order of arrival, replaced ones left out.
     pub fn level(&self, level: u32) -> impl Iterator<Item = &C> {
-        self.log
-            .iter()
-            .enumerate()
-            .filter(move |(at, (tag, r))| tag.level == level && self.index.get(&r.id()) == Some(at))
-            .map(|(_, (_, r))| r)
+        let of_level = self.log.iter().enumerate().filter(move |(_, (tag, _))| tag.level == level);
+        // Nearly always there is nothing to look up.
+        let current = move |at, id| self.replaced.is_empty() || self.position_of(id) == Some(at);
+        of_level.filter(move |(at, (_, record))| current(*at, record.id())).map(|(_, (_, record))| record)
     }
 
     /// All records.

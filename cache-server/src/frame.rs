@@ -28,6 +28,10 @@ const COMPLETE_BYTES_MAX: usize = 4 << 20;
 /// workers finish a step together (guided self-scheduling).
 const SHARES: u32 = 4;
 
+/// What a lease should take at least, as far as those done tell: a small part of that is spent on giving it out. No
+/// lease is more than an equal share for that.
+const LEASE_LEAST: Duration = Duration::from_millis(10);
+
 /// Most reasons of workers that wait for the owner; more are dropped, the first ones say enough.
 const DECLINES_MAX: usize = 64;
 
@@ -131,11 +135,18 @@ impl Frame {
         let room = self.room();
         let fit = workers.saturating_sub(self.unfit.len() as u32).max(1);
         let round = self.round.as_mut()?;
-        let share = (round.pending_tiles() / fit.saturating_mul(SHARES)).max(1);
+        let pending = round.pending_tiles();
+        let least = round.tiles_in(LEASE_LEAST).min(pending / fit);
+        let share = (pending / fit.saturating_mul(SHARES)).max(least).max(1);
         let tiles =
             (room > 0).then(|| round.grant(lease, worker.clone(), share.min(room), now, now + LEASE_TIME))??;
         let step = Some(round.step().clone());
         Some(v1::Lease { id: lease, frame: self.id, step, tile_from: tiles.start, tile_to: tiles.end })
+    }
+
+    /// Whether there is something to lease.
+    pub fn has_work(&self) -> bool {
+        self.round.as_ref().is_some_and(|round| round.pending_tiles() > 0) && self.room() > 0
     }
 
     /// Most tiles one lease may have now: what the owner can still take, if they are pixels.
@@ -164,7 +175,12 @@ impl Frame {
     ///
     /// # Errors
     /// What is unsound about the request; the worker keeps the lease then.
-    pub fn complete(&mut self, request: v1::CompleteRequest, mark: impl FnOnce(u32) -> Mark) -> Result<bool, Refusal> {
+    pub fn complete(
+        &mut self,
+        request: v1::CompleteRequest,
+        now: Duration,
+        mark: impl FnOnce(u32) -> Mark,
+    ) -> Result<bool, Refusal> {
         let Some(round) = &mut self.round else { return Ok(false) };
         let Some(held) = round.held(request.lease, &request.worker) else { return Ok(false) };
         let expected = if round.makes_pixels() { held.tiles.clone() } else { 0..0 };
@@ -172,7 +188,7 @@ impl Frame {
         check_tiles(&self.job, expected, &request.tiles)?;
         check_counts(&self.counts, &request.counts)?;
 
-        round.complete(request.lease, request.gathered);
+        round.complete(request.lease, request.gathered, now);
         for count in request.counts {
             *self.counts.entry(count.name).or_default() += count.value;
         }
@@ -190,7 +206,7 @@ impl Frame {
         self.round = self.plan.next(gathered).map(|step| {
             let mark = mark(self.steps);
             let step = convert::step(self.steps, &step, mark.position, mark.sum.digest);
-            Round::new(step, self.job.tiles)
+            Round::new(step, &self.job)
         });
         if let Some(round) = &self.round {
             self.steps += 1;

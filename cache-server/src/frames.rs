@@ -125,9 +125,9 @@ impl Frames {
         }
         let Some(frame) = self.frames.get_mut(&request.frame) else { return Ok(false) };
         let draft = frame.origin().draft;
-        let step = frame.round().map(|round| round.step().index);
+        let (step, had_work) = (frame.round().map(|round| round.step().index), frame.has_work());
         let since = frame.round().and_then(|round| round.held(request.lease, &request.worker)).map(|held| held.since);
-        let accepted = frame.complete(request, |step| mark(&draft, step))?;
+        let accepted = frame.complete(request, now, |step| mark(&draft, step))?;
         self.changes.news |= accepted;
         if let Some(since) = since.filter(|_| accepted) {
             metrics::completed(now.saturating_sub(since));
@@ -135,7 +135,7 @@ impl Frames {
         // A lease of pixels that brought less than the most a tile can have leaves room for others.
         let pixels = frame.round().is_some_and(|round| round.makes_pixels());
         let advanced = step != frame.round().map(|round| round.step().index);
-        self.changes.work |= accepted && (pixels || advanced);
+        self.changes.work |= frame.has_work() && (!had_work || advanced);
         if accepted && pixels && advanced && frame.job().spec.levels > 0 {
             self.changes.filled = Some((draft, frame.job().namespace));
         }

@@ -245,6 +245,16 @@ fn open(frames: &mut Frames, tiles: u32, levels: u32) -> u64 {
 }
 
 fn complete(frames: &mut Frames, worker: &str, lease: &v1::Lease, bytes: usize) -> Result<bool, Refusal> {
+    complete_at(frames, worker, lease, bytes, Duration::ZERO)
+}
+
+fn complete_at(
+    frames: &mut Frames,
+    worker: &str,
+    lease: &v1::Lease,
+    bytes: usize,
+    now: Duration,
+) -> Result<bool, Refusal> {
     let tile = |tile| v1::FrameTile { tile, pixels: vec![0; bytes].into() };
     let request = v1::CompleteRequest {
         worker: worker.into(),
@@ -253,7 +263,7 @@ fn complete(frames: &mut Frames, worker: &str, lease: &v1::Lease, bytes: usize) 
         tiles: (lease.tile_from..lease.tile_to).map(tile).collect(),
         ..Default::default()
     };
-    frames.complete(request, Duration::ZERO, |_, _| Mark::default())
+    frames.complete(request, now, |_, _| Mark::default())
 }
 
 #[test]
@@ -267,6 +277,48 @@ fn leases_shrink_as_work_runs_out_and_lost_tiles_are_given_first() {
     assert!(frames.take_changes().work);
     assert_eq!(range(lease(&mut frames, "b", 0)), Some(0..14));
     assert_eq!(range(lease(&mut frames, "b", 0)), Some(14..16));
+}
+
+#[test]
+fn leases_of_quick_tiles_are_larger() {
+    for (milliseconds, next) in [(1, 48), (40, 12), (16_000, 12)] {
+        let mut frames = Frames::new(Limits::default(), 1);
+        open(&mut frames, 64, 0);
+        let first = lease(&mut frames, "a", 0).expect("work");
+        let now = Duration::from_millis(milliseconds);
+        assert!(complete_at(&mut frames, "a", &first, 4 * 4 * 3, now).expect("sound"));
+        let second = lease(&mut frames, "a", 16).expect("work");
+        assert_eq!((first.tile_to, second.tile_to - second.tile_from), (16, next), "{milliseconds} ms");
+    }
+}
+
+#[test]
+fn a_lease_has_something_to_do() {
+    let mut frames = Frames::new(Limits::default(), 1);
+    // Tiles of 4 x 4 pixels in a row: the first round tests one pixel of the first tile, and then of every 16th.
+    open(&mut frames, 64, 1);
+    let range = |lease: Option<v1::Lease>| lease.map(|l| l.tile_from..l.tile_to);
+    assert_eq!(range(lease(&mut frames, "a", 0)), Some(0..16));
+    assert_eq!(range(lease(&mut frames, "b", 0)), Some(16..32));
+    frames.leave("a");
+    assert_eq!(range(lease(&mut frames, "b", 0)), Some(0..16));
+    assert_eq!(range(lease(&mut frames, "c", 0)), Some(32..48));
+    // The pattern fits no other tiles, and the rows below the picture are nobody's.
+    let odd = v1::FrameSpec { width: 64 * 5, height: 5, tile_size: 5, ..spec(1, 1) };
+    opened(&mut frames, odd).expect("room");
+    assert_eq!(range(lease(&mut frames, "d", 0)), Some(48..64));
+    assert_eq!(range(lease(&mut frames, "d", 0)), Some(0..4));
+}
+
+#[test]
+fn workers_that_wait_are_woken_for_work_alone() {
+    let mut frames = Frames::new(Limits::default(), 1);
+    open(&mut frames, 2, 0);
+    let held = [0, 1].map(|_| lease(&mut frames, "a", 0).expect("work"));
+    assert_eq!(lease(&mut frames, "b", 0), None);
+    frames.take_changes();
+    assert!(complete(&mut frames, "a", &held[0], 4 * 4 * 3).expect("sound"));
+    assert!(!frames.take_changes().work, "all tiles are leased");
 }
 
 #[test]

@@ -51,7 +51,7 @@ const fn bound(
 const ANY: RangeInclusive<usize> = 1..=1 << 20;
 
 const BOUNDS: [Bound; 9] = [
-    bound("records", "records in all namespaces together", 32 << 20, 1..=1 << 40, |l| &mut l.records),
+    bound("records", "records in all namespaces together", 32 << 20, 1..=(1 << 32) - 1, |l| &mut l.records),
     bound("namespaces", "namespaces, drafts of frames among them", 1024, ANY, |l| &mut l.namespaces),
     bound("connections", "connections; each may use 4 MiB", 2048, ANY, |l| &mut l.connections),
     bound("calls", "calls at once on one connection", 256, 8..=1 << 16, |l| &mut l.calls),

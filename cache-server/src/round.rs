@@ -5,7 +5,10 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::time::Duration;
 
+use cache_core::rounds::{PATTERN, rank};
 use cache_proto::v1;
+
+use crate::spec::Job;
 
 /// A range of tiles a worker does.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -33,14 +36,58 @@ pub struct Round {
     leases: BTreeMap<u64, Held>,
     leased_tiles: u32,
     tiles: u32,
+    empty: Empty,
     gathered: u64,
+    /// Time from grant to end of the leases that are done, all together.
+    spent: Duration,
+}
+
+/// Which tiles have nothing to do: no pixel whose rank the step tests lies in them.
+#[derive(Debug)]
+struct Empty {
+    columns: u32,
+    /// The pattern repeats after so many tiles, across and down.
+    period: u32,
+    of_period: Vec<bool>,
+}
+
+impl Empty {
+    fn new(step: &v1::Step, spec: &v1::FrameSpec) -> Self {
+        let (edge, columns) = (spec.tile_size, spec.width.div_ceil(spec.tile_size));
+        if step.level == 0 || !PATTERN.is_multiple_of(edge) {
+            return Self { columns, period: 1, of_period: vec![false] };
+        }
+        let (period, ranks) = (PATTERN / edge, step.rank_from..step.rank_to);
+        let mut of_period = vec![true; (period * period) as usize];
+        for (x, y) in (0..PATTERN * PATTERN).map(|at| (at % PATTERN, at / PATTERN)) {
+            if ranks.contains(&rank(x, y)) {
+                of_period[(y / edge * period + x / edge) as usize] = false;
+            }
+        }
+        Self { columns, period, of_period }
+    }
+
+    fn has(&self, tile: u32) -> bool {
+        let (column, row) = (tile % self.columns % self.period, tile / self.columns % self.period);
+        self.of_period[(row * self.period + column) as usize]
+    }
 }
 
 impl Round {
-    /// A step with all its `tiles` pending.
-    pub fn new(step: v1::Step, tiles: u32) -> Self {
-        let pending = BTreeMap::from([(0, tiles)]);
-        Self { step, pending, pending_tiles: tiles, leases: BTreeMap::new(), leased_tiles: 0, tiles, gathered: 0 }
+    /// A step with all tiles of the picture pending.
+    pub fn new(step: v1::Step, job: &Job) -> Self {
+        let (tiles, empty) = (job.tiles, Empty::new(&step, &job.spec));
+        Self {
+            step,
+            pending: BTreeMap::from([(0, tiles)]),
+            pending_tiles: tiles,
+            leases: BTreeMap::new(),
+            leased_tiles: 0,
+            tiles,
+            empty,
+            gathered: 0,
+            spent: Duration::ZERO,
+        }
     }
 
     /// What the step is.
@@ -83,7 +130,15 @@ impl Round {
         self.gathered
     }
 
-    /// Leases up to `most` of the lowest pending tiles, contiguous. `None` when none is pending.
+    /// How many tiles take one worker that long, as far as those done tell; 0 if they tell nothing.
+    pub fn tiles_in(&self, time: Duration) -> u32 {
+        let tiles = f64::from(self.done_tiles()) * time.as_secs_f64() / self.spent.as_secs_f64();
+        // Infinity and what is more than all saturate.
+        if self.spent.is_zero() { 0 } else { tiles as u32 }
+    }
+
+    /// Leases up to `most` of the lowest pending tiles, contiguous, and empty ones behind them; more if all those are
+    /// empty, since a lease costs more than looking at nothing. `None` when none is pending.
     pub fn grant(
         &mut self,
         lease: u64,
@@ -93,7 +148,12 @@ impl Round {
         deadline: Duration,
     ) -> Option<Range<u32>> {
         let (from, to) = self.pending.pop_first()?;
-        let cut = from.saturating_add(most.max(1)).min(to);
+        let mut cut = from.saturating_add(most.max(1)).min(to);
+        let mut idle = (from..cut).all(|tile| self.empty.has(tile));
+        while cut < to && (idle || self.empty.has(cut)) {
+            idle &= self.empty.has(cut);
+            cut += 1;
+        }
         if cut < to {
             self.pending.insert(cut, to);
         }
@@ -127,10 +187,11 @@ impl Round {
     }
 
     /// Ends a lease whose tiles are done. Unknown leases change nothing.
-    pub fn complete(&mut self, lease: u64, gathered: u64) {
+    pub fn complete(&mut self, lease: u64, gathered: u64, now: Duration) {
         if let Some(held) = self.leases.remove(&lease) {
             self.leased_tiles -= held.tiles.end - held.tiles.start;
             self.gathered += gathered;
+            self.spent += now.saturating_sub(held.since);
         }
     }
 

@@ -44,15 +44,16 @@ const KEEPALIVE: Duration = Duration::from_secs(10);
 const DRAIN: Duration = Duration::from_secs(5);
 
 /// Largest message to the cache service, bytes: 65536 points of a query fit.
-const CACHE_MESSAGE_MAX: usize = 2 << 20;
+pub const CACHE_MESSAGE_MAX: usize = 2 << 20;
 
 /// Largest message to the frames service, bytes: the tiles of a lease fit.
 const FRAMES_MESSAGE_MAX: usize = 8 << 20;
 
-/// HTTP/2 windows, bytes: what a client may send ahead on one stream, and on one connection. A connection can make the
-/// server hold no more than the second.
-const STREAM_WINDOW: u32 = 1 << 20;
-const CONNECTION_WINDOW: u32 = 2 << 20;
+/// HTTP/2 window, bytes: what a client may send ahead on one stream.
+pub const STREAM_WINDOW: u32 = 1 << 20;
+
+/// The same for one connection, and the most it can make the server hold.
+pub const CONNECTION_WINDOW: u32 = 2 << 20;
 
 /// Longest list of headers of one call, bytes.
 const HEADERS_MAX: u32 = 16 << 10;

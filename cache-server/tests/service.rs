@@ -217,6 +217,25 @@ fn points(queries: &[Query]) -> Vec<u8> {
 }
 
 #[tokio::test]
+async fn many_subscribers_hear_everything() {
+    let server = Server::unix().await;
+    let mut cache = server.cache();
+    let mut streams = Vec::new();
+    for _ in 0..128 {
+        streams.push(subscribed(&mut cache, subscribe(0), 0).await);
+    }
+    let all = records(0..100);
+    for record in &all {
+        insert(&mut cache, vec![convert::pack(&NAMESPACE, Tag::level(1), [record])]).await.expect("kept");
+    }
+    for stream in &mut streams {
+        let heard: Vec<_> = read(stream, 0, all.len()).await.into_iter().map(|(_, record)| record).collect();
+        assert_eq!(heard, all);
+    }
+    server.stop().await;
+}
+
+#[tokio::test]
 async fn query_answers_what_a_replica_would_bit_for_bit() {
     let server = Server::tcp().await;
     let mut cache = server.cache();

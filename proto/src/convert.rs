@@ -124,8 +124,11 @@ pub fn unpack<C: Cached>(batch: &v1::RecordBatch) -> Result<(Namespace, Tag, Vec
     if batch.records.len() > BATCH_RECORDS_MAX * C::BYTES {
         return Err(Malformed::TooMany(batch.records.len()));
     }
-    let record = |(index, bytes)| C::decode(bytes).map_err(|reason| Malformed::Record { index, reason });
-    let records = batch.records.chunks(C::BYTES).enumerate().map(record).collect::<Result<_, _>>()?;
+    // Collecting results would not know how many come.
+    let mut records = Vec::with_capacity(batch.records.len().div_ceil(C::BYTES));
+    for (index, bytes) in batch.records.chunks(C::BYTES).enumerate() {
+        records.push(C::decode(bytes).map_err(|reason| Malformed::Record { index, reason })?);
+    }
     Ok((namespace, Tag { level: batch.level, step: batch.step }, records))
 }
 

@@ -137,21 +137,32 @@ pub struct Place {
 impl Place {
     /// Puts entries, as [`split`] groups them, into one value, and moves on to the place behind it.
     pub fn seal(&mut self, entries: &[v1::Entry]) -> Vec<u8> {
-        let mut payload = Vec::with_capacity(entries.iter().map(weight).sum());
+        let mut value = Vec::with_capacity(HEADER + entries.iter().map(weight).sum::<usize>());
+        value.resize(HEADER, 0);
         for entry in entries {
             // A vector grows: there is room.
-            let _ = entry.encode_length_delimited(&mut payload);
+            let _ = entry.encode_length_delimited(&mut value);
         }
-        self.seal_payload(entries.iter().map(records).sum(), &payload)
+        self.head(entries.iter().map(records).sum(), &mut value);
+        value
     }
 
     /// Puts a payload of at most [`PAYLOAD_MAX`] bytes that holds so many records into a value.
     pub fn seal_payload(&mut self, records: u64, payload: &[u8]) -> Vec<u8> {
+        let mut value = [&[0; HEADER], payload].concat();
+        self.head(records, &mut value);
+        value
+    }
+
+    /// Writes the header before the payload that stands behind it.
+    fn head(&mut self, records: u64, value: &mut [u8]) {
+        let (head, payload) = value.split_at_mut(HEADER);
         let (length, sequence, before) = (payload.len(), self.sequence, self.before);
         let mut header = Header { length, sequence, before, records, checksum: Default::default() };
         header.checksum = checksum(&header.begin(), payload);
+        head[..40].copy_from_slice(&header.begin());
+        head[40..].copy_from_slice(&header.checksum);
         *self = self.after(&header);
-        [&header.begin()[..], &header.checksum, payload].concat()
     }
 
     /// Whether a value of this header belongs here.

@@ -1,0 +1,187 @@
+//! A server in a process of its own, so that its CPU time and memory can be told from its clients'.
+
+use std::error::Error;
+use std::io::{BufRead as _, BufReader, Write as _};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+
+use cache_proto::v1::cache_server::CacheServer;
+use cache_server::journal::Journal;
+use cache_server::journal::device::Sync;
+use cache_server::journal::disk::Disk;
+use cache_server::serve::{CACHE_MESSAGE_MAX, CONNECTION_WINDOW, STREAM_WINDOW};
+use cache_server::{Config, Listen};
+use nix::sys::resource::{UsageWho, getrusage};
+use tempfile::TempDir;
+use tokio::net::{UnixListener, UnixStream};
+use tokio_stream::wrappers::UnixListenerStream;
+use tonic::transport::Server;
+use worker::client::{Line, connect_with};
+
+use crate::bare::Bare;
+use crate::records;
+
+/// What is behind the socket.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, clap::ValueEnum)]
+pub enum Kind {
+    /// Nothing: the bare stream, its messages forgotten.
+    Bare,
+    /// Nothing, but the messages are kept in memory as they came.
+    Keep,
+    /// The service, records in memory only.
+    Memory,
+    /// The service, records durable in the kernel's page cache.
+    Page,
+    /// The service, records durable on the device.
+    Device,
+}
+
+/// The server's arguments.
+#[derive(Clone, Debug, clap::Args)]
+pub struct HostArgs {
+    kind: Kind,
+    /// Folder for the socket and the journal.
+    folder: PathBuf,
+    /// Records in all, and in one batch, that a bare stream has to send.
+    prepared: u64,
+    size: u64,
+}
+
+/// CPU time and memory of a process.
+#[derive(Clone, Copy, Default, Debug)]
+pub struct Usage {
+    /// CPU seconds, all threads, user and system.
+    pub cpu: f64,
+    /// Most memory resident so far, bytes.
+    pub peak: f64,
+}
+
+/// A running server. Dropping it ends the process.
+pub struct Host {
+    child: Child,
+    ask: ChildStdin,
+    answers: BufReader<ChildStdout>,
+    folder: TempDir,
+}
+
+impl Host {
+    /// Starts a server and waits until it listens. A bare stream has `prepared` records to send in batches of `size`.
+    ///
+    /// # Errors
+    /// When it does not come up.
+    pub fn start(kind: Kind, prepared: u64, size: u64) -> Result<Self, Box<dyn Error>> {
+        // Not in memory, whatever the system's own choice is: journals are measured.
+        let folder = tempfile::Builder::new().prefix("ambience-bench-").tempdir_in("/var/tmp")?;
+        let name = clap::ValueEnum::to_possible_value(&kind).ok_or("no such kind")?;
+        let mut child = Command::new(std::env::current_exe()?)
+            .args(["host", name.get_name()])
+            .arg(folder.path())
+            .args([prepared.to_string(), size.to_string()])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()?;
+        let (ask, answers) = (child.stdin.take().ok_or("no stdin")?, child.stdout.take().ok_or("no stdout")?);
+        let mut host = Self { child, ask, answers: BufReader::new(answers), folder };
+        host.usage()?;
+        Ok(host)
+    }
+
+    /// A new connection.
+    pub fn connect(&self) -> Line {
+        let path = socket(self.folder.path());
+        connect_with(move || UnixStream::connect(path.clone()))
+    }
+
+    /// What it has used so far.
+    ///
+    /// # Errors
+    /// When it has ended.
+    pub fn usage(&mut self) -> Result<Usage, Box<dyn Error>> {
+        writeln!(self.ask)?;
+        let mut line = String::new();
+        self.answers.read_line(&mut line)?;
+        let (cpu, peak) = line.trim().split_once(' ').ok_or("the server has ended")?;
+        Ok(Usage { cpu: cpu.parse()?, peak: peak.parse()? })
+    }
+}
+
+impl Drop for Host {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn socket(folder: &Path) -> PathBuf {
+    folder.join("socket")
+}
+
+/// What this process has used so far.
+///
+/// # Errors
+/// The system's.
+pub fn usage() -> Result<Usage, nix::Error> {
+    let usage = getrusage(UsageWho::RUSAGE_SELF)?;
+    let seconds = |time: nix::sys::time::TimeVal| time.tv_sec() as f64 + time.tv_usec() as f64 * 1e-6;
+    let cpu = seconds(usage.user_time()) + seconds(usage.system_time());
+    // Linux counts the parent's memory into `max_rss` from before the program was its own.
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:")?.trim().strip_suffix(" kB")?.parse().ok());
+    Ok(Usage { cpu, peak: peak.map_or(usage.max_rss() as f64, |kilobytes: f64| kilobytes * 1024.0) })
+}
+
+/// The server's side: serves until its stdin ends, and answers each line there with its [`Usage`].
+///
+/// # Errors
+/// When it cannot.
+pub fn serve(args: &HostArgs) -> Result<(), Box<dyn Error>> {
+    let prepared = match args.kind {
+        Kind::Bare => records::batches(&records::NAMESPACE, args.prepared, args.size),
+        _ => Vec::new(),
+    };
+    let runtime = tokio::runtime::Runtime::new()?;
+    let _within = runtime.enter();
+    let path = socket(&args.folder);
+    let serving: std::pin::Pin<Box<dyn Future<Output = Result<(), String>> + Send>> = match journal(args)? {
+        None => {
+            let keeps = args.kind == Kind::Keep;
+            let incoming = UnixListenerStream::new(UnixListener::bind(&path)?);
+            let bare = CacheServer::new(Bare::new(prepared, keeps)).max_decoding_message_size(CACHE_MESSAGE_MAX);
+            let server = Server::builder()
+                .initial_stream_window_size(STREAM_WINDOW)
+                .initial_connection_window_size(CONNECTION_WINDOW)
+                .add_service(bare);
+            Box::pin(async { server.serve_with_incoming(incoming).await.map_err(|e| e.to_string()) })
+        }
+        Some(journal) => {
+            let bound = cache_server::bind(&Listen::Unix(path), false)?;
+            let config = Config { journal, ..Config::default() };
+            let serving = cache_server::serve(vec![bound], config, std::future::pending());
+            Box::pin(async { serving.await.map_err(|e| e.to_string()) })
+        }
+    };
+    let serving = runtime.spawn(async {
+        if let Err(error) = serving.await {
+            eprintln!("host: {error}");
+        }
+    });
+    for _ in std::io::stdin().lines() {
+        let Usage { cpu, peak } = usage()?;
+        println!("{cpu} {peak}");
+    }
+    serving.abort();
+    runtime.shutdown_background();
+    Ok(())
+}
+
+fn journal(args: &HostArgs) -> Result<Option<Box<dyn Journal>>, Box<dyn Error>> {
+    let disk =
+        |sync| Disk::open(&args.folder.join("journal"), sync).map(|(disk, _)| Box::new(disk) as Box<dyn Journal>);
+    Ok(match args.kind {
+        Kind::Bare | Kind::Keep => None,
+        Kind::Memory => Some(Box::new(cache_server::journal::Nowhere)),
+        Kind::Page => Some(disk(Sync::PageCache).map_err(|e| e.to_string())?),
+        Kind::Device => Some(disk(Sync::Device).map_err(|e| e.to_string())?),
+    })
+}
