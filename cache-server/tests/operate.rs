@@ -2,14 +2,18 @@
 
 mod support;
 
-use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::io::{self, BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{TcpListener, TcpStream};
 use std::os::unix::fs::PermissionsExt as _;
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use cache_core::Namespace;
 use cache_proto::v1;
 use cache_proto::v1::cache_client::CacheClient;
+use cache_server::Config;
+use cache_server::journal::Journal;
 use support::{insert, soon, subscribe};
 use tonic::Code;
 use tonic::transport::{Channel, Endpoint};
@@ -148,6 +152,45 @@ fn metrics(address: &str) -> String {
     let mut text = String::new();
     stream.read_to_string(&mut text).expect("read");
     text
+}
+
+/// A journal on a disk that is full for a while.
+struct Full(Arc<AtomicBool>);
+
+impl Journal for Full {
+    fn append(&mut self, _: &[v1::Entry]) -> io::Result<()> {
+        if self.0.load(Ordering::Relaxed) { Err(io::ErrorKind::StorageFull.into()) } else { Ok(()) }
+    }
+
+    fn replay(&mut self, _: &mut dyn FnMut(v1::Entry) -> io::Result<()>) -> io::Result<()> {
+        Ok(())
+    }
+
+    fn waits(&self) -> bool {
+        false
+    }
+}
+
+#[tokio::test]
+async fn health_is_told_by_the_journal() {
+    let full = Arc::new(AtomicBool::new(false));
+    let server = support::Server::start(Config { journal: Box::new(Full(full.clone())), ..Config::default() });
+    let (mut cache, watch) = (server.cache(), HealthCheckRequest { service: "ambience.v1.Cache".into() });
+    let mut health = HealthClient::new(soon(server.endpoint().connect()).await.expect("connected"));
+    let mut health = soon(health.watch(watch)).await.expect("known").into_inner();
+    let mut expect = async |status: ServingStatus| {
+        let told = soon(health.message()).await.expect("no error").expect("no end");
+        assert_eq!(told.status, status as i32);
+    };
+    expect(ServingStatus::Serving).await;
+    full.store(true, Ordering::Relaxed);
+    let refused = soon(cache.insert(insert(Namespace([5; 32]), 0..9))).await.expect_err("full");
+    assert_eq!(refused.code(), Code::Unavailable, "{refused}");
+    expect(ServingStatus::NotServing).await;
+    full.store(false, Ordering::Relaxed);
+    soon(cache.insert(insert(Namespace([5; 32]), 0..9))).await.expect("room again");
+    expect(ServingStatus::Serving).await;
+    server.stop().await;
 }
 
 #[tokio::test]
