@@ -199,3 +199,58 @@ impl<IO: AsyncWrite + Unpin> AsyncWrite for Guest<IO> {
         Pin::new(&mut self.io).poll_shutdown(context)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{AsyncReadExt as _, DuplexStream, duplex};
+    use tokio_stream::StreamExt as _;
+
+    use super::*;
+
+    fn door(most: usize) -> Arc<Door> {
+        Arc::new(Door::new(most))
+    }
+
+    fn enter(door: &Arc<Door>) -> (Option<Guest<DuplexStream>>, DuplexStream) {
+        let (near, far) = duplex(64);
+        (door.enter(near), far)
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_connection_without_a_call_is_cut() {
+        let door = door(2);
+        let (silent, _far) = enter(&door);
+        let (talking, _other) = enter(&door);
+        let (mut silent, mut talking) = (silent.expect("room"), talking.expect("room"));
+        talking.connect_info().stay();
+        let mut byte = [0];
+        assert!(tokio::time::timeout(GREETING / 2, silent.read(&mut byte)).await.is_err(), "not yet");
+        let cut = silent.read(&mut byte).await.expect_err("cut");
+        assert_eq!(cut.kind(), io::ErrorKind::TimedOut);
+        assert!(tokio::time::timeout(GREETING * 100, talking.read(&mut byte)).await.is_err(), "stays");
+    }
+
+    #[tokio::test]
+    async fn past_the_bound_connections_are_told_and_very_many_are_closed() {
+        let door = door(3);
+        let mut guests: Vec<_> = (0..3 + TOLD).map(|_| enter(&door).0.expect("let in")).collect();
+        let full: Vec<_> = guests.iter().map(|guest| guest.connect_info().full()).collect();
+        assert!(full[..3].iter().all(Option::is_none) && full[3..].iter().all(|full| *full == Some(3)));
+        assert!(enter(&door).0.is_none());
+        assert_eq!(door.open(), 3 + TOLD);
+        guests.truncate(2);
+        assert_eq!(enter(&door).0.expect("let in").connect_info().full(), None);
+        assert_eq!(door.open(), 2);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_connection_that_cannot_be_accepted_is_not_the_end() {
+        let (near, _far) = duplex(64);
+        let incoming = tokio_stream::iter([Err(io::Error::other("too many open files")), Ok(near)]);
+        let began = tokio::time::Instant::now();
+        let mut guests = door(1).guests(incoming);
+        assert!(guests.next().await.expect("one").is_ok());
+        assert!(began.elapsed() >= PAUSE, "it does not try again at once");
+        assert!(guests.next().await.is_none());
+    }
+}

@@ -149,6 +149,8 @@ mod tests {
                 assert!(error.contains(&least.to_string()) && error.contains(&most.to_string()), "{error}");
             }
             assert!(help().contains(bound.name));
+            let row = format!("| `{}` |", bound.name);
+            assert!(include_str!("../../docs/operating.md").contains(&row), "docs/operating.md has no row {row}");
         }
         assert!("record=5".parse::<Setting>().expect_err("no such").contains("namespaces"));
         assert!("records".parse::<Setting>().is_err() && "records=many".parse::<Setting>().is_err());

@@ -184,7 +184,7 @@ async fn random_bytes_and_cut_frames() {
         }
     }
     neighbour.works().await;
-    server.ends_below(128 * MIB);
+    server.ends_below(64 * MIB);
 }
 
 #[tokio::test]
@@ -225,7 +225,7 @@ async fn messages_that_are_not_what_they_say() {
         calls.iter().for_each(tokio::task::JoinHandle::abort);
     }
     neighbour.works().await;
-    server.ends_below(128 * MIB);
+    server.ends_below(64 * MIB);
 }
 
 #[tokio::test]
@@ -256,7 +256,7 @@ async fn records_that_are_none() {
         assert!(refused.message().contains(what), "{what}: {refused}");
     }
     neighbour.works().await;
-    server.ends_below(128 * MIB);
+    server.ends_below(64 * MIB);
 }
 
 #[tokio::test]
@@ -280,7 +280,7 @@ async fn records_that_reach_hardly_anywhere_or_everywhere() {
     let query = v1::QueryRequest { namespace: namespace.0.to_vec().into(), level: 1, a: 1.0, points };
     let (answers, ()) = tokio::join!(soon(cache.query(query)), neighbour.works());
     assert_eq!(answers.expect("answered").into_inner().answers.len(), 16_000);
-    server.ends_below(128 * MIB);
+    server.ends_below(64 * MIB);
 }
 
 #[tokio::test]
@@ -313,7 +313,7 @@ async fn those_who_begin_and_do_not_go_on() {
     }
     assert!(told > 100, "{told} of 150 were told that it is too much");
     drop(deaf);
-    server.ends_below(256 * MIB);
+    server.ends_below(64 * MIB);
 }
 
 #[tokio::test]
@@ -346,7 +346,7 @@ async fn a_flood_of_connections() {
         served = soon(CacheClient::new(server.connect().await).info(v1::InfoRequest {})).await.is_ok();
     }
     neighbour.works().await;
-    server.ends_below(128 * MIB);
+    server.ends_below(64 * MIB);
 }
 
 #[tokio::test]
@@ -370,5 +370,5 @@ async fn a_flood_of_calls_that_are_taken_back() {
         }
     }
     neighbour.works().await;
-    server.ends_below(128 * MIB);
+    server.ends_below(64 * MIB);
 }
