@@ -130,7 +130,12 @@ impl<C: Cached> RecordSet<C> {
 
     /// The record of an id.
     pub fn get(&self, id: RecordId) -> Option<&(Tag, C)> {
-        self.index.get(&id).map(|&at| &self.log[at])
+        self.position_of(id).map(|at| &self.log[at])
+    }
+
+    /// Where the record of an id stands in the log.
+    pub fn position_of(&self, id: RecordId) -> Option<usize> {
+        self.index.get(&id).copied()
     }
 
     /// The log from a position on, in order of arrival. Empty past the end.

@@ -1,11 +1,15 @@
 //! The arguments of `cache-server`, which `ambience serve` re-uses, and what it does with them.
 
 use std::io::Write as _;
+use std::path::{Path, PathBuf};
 
 use tokio::signal::unix::{SignalKind, signal};
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::LevelFilter;
 
+use crate::journal::Journal;
+use crate::journal::device::Sync;
+use crate::journal::disk::Disk;
 use crate::listen::{Listen, ServeError, bind};
 use crate::serve::{Config, serve};
 
@@ -18,6 +22,9 @@ pub struct ServeArgs {
     /// Allow addresses that other machines can reach; whoever can connect may read and change everything
     #[arg(long)]
     pub insecure: bool,
+    /// Keep records in this directory: what was acknowledged survives the server [default: in memory only]
+    #[arg(long, value_name = "DIR")]
+    pub data: Option<PathBuf>,
 }
 
 /// Runs a server until Ctrl-C or SIGTERM, then lets running calls end. Prints `listening on ADDR` to stdout for each
@@ -30,6 +37,10 @@ pub async fn run(args: ServeArgs) -> Result<(), ServeError> {
     // Before binding, so that a signal at any time after removes the sockets' files.
     let mut interrupt = signal(SignalKind::interrupt()).map_err(failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(failed)?;
+    let config = match &args.data {
+        Some(directory) => Config { journal: open(directory)?, ..Config::default() },
+        None => Config::default(),
+    };
     let sockets = args.listen.iter().map(|listen| bind(listen, args.insecure)).collect::<Result<Vec<_>, _>>()?;
     for socket in &sockets {
         tracing::info!(address = %socket.address(), version = cache_proto::VERSION, "listening");
@@ -43,7 +54,19 @@ pub async fn run(args: ServeArgs) -> Result<(), ServeError> {
         }
         tracing::info!("shutting down");
     };
-    serve(sockets, Config::default(), shutdown).await
+    serve(sockets, config, shutdown).await
+}
+
+fn open(directory: &Path) -> Result<Box<dyn Journal>, ServeError> {
+    let (journal, report) = Disk::open(directory, Sync::Device).map_err(|error| match error.exit_code() {
+        2 => ServeError::Usage(format!("--data: {error}")),
+        _ => ServeError::Failed(format!("--data: {error}")),
+    })?;
+    tracing::info!(directory = %directory.display(), records = report.records, "recovered");
+    if let Some(damage) = report.damage {
+        tracing::warn!("{} {damage}", directory.display());
+    }
+    Ok(Box::new(journal))
 }
 
 /// Sends logs to stderr, as much as RUST_LOG says (default: info). For programs, once; libraries only log.

@@ -3,31 +3,27 @@
 //! Each of its threads holds one lease at a time. What a lease yields depends on the frame, the step and the tiles alone,
 //! so a lease that is lost on the way is simply done again by somebody.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::hash::{BuildHasher as _, Hasher as _};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use cache_core::Namespace;
-use cache_proto::{VERSION, convert, v1};
-use tokio::sync::OnceCell;
+use cache_core::{Irradiance, Namespace, Tag};
+use cache_proto::{VERSION, v1};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 use tonic::{Code, Status};
 use tracing::{debug, info, warn};
 
-use crate::client::{self, Address, Cache, Frames};
-use crate::follow::{self, Follower};
+use crate::client::{self, Address, Backoff, Cache, Frames};
+use crate::follow;
 use crate::frame::Frame;
-use crate::job::{Dropped, Job, Known, Work, off_thread};
-use crate::replica::{Caches, ReplicaError};
-use crate::task::Done;
+use crate::job::{Dropped, Job, Work};
+use crate::ready::{Fault, Shelf};
+use crate::threads::lock;
 
 /// Leases live a few seconds on the server; this is several times as often.
 const RENEW: Duration = Duration::from_millis(1500);
-
-/// Frames kept ready, the last used ones.
-const FRAMES_KEPT: usize = 4;
 
 /// How long a departing worker waits for the server to hear of it.
 const FAREWELL: Duration = Duration::from_secs(2);
@@ -136,34 +132,6 @@ async fn stopped() {
     }
 }
 
-/// Why a lease did not come to its end.
-enum Fault {
-    /// It is no longer ours, or its frame is gone.
-    Gone,
-    /// This worker cannot do the frame, and why.
-    Unfit(String),
-    /// The server.
-    Server(Status),
-}
-
-impl From<Status> for Fault {
-    fn from(status: Status) -> Self {
-        if status.code() == Code::NotFound { Self::Gone } else { Self::Server(status) }
-    }
-}
-
-/// A frame made ready.
-struct Loaded<J> {
-    job: Arc<J>,
-    /// Where its records go.
-    draft: Namespace,
-    /// Absent for methods without records.
-    follower: Option<Arc<Follower>>,
-    caches: Arc<Mutex<Caches>>,
-}
-
-type Slot<J> = Arc<OnceCell<Arc<Loaded<J>>>>;
-
 /// One worker process as the server knows it, and the kind of job it does.
 pub struct Worker<J> {
     name: String,
@@ -171,9 +139,7 @@ pub struct Worker<J> {
     frames: Frames,
     /// Leases being worked on, which the server has not declared lost.
     held: Mutex<BTreeSet<u64>>,
-    /// Last used last.
-    loaded: Mutex<Vec<(u64, Slot<J>)>>,
-    followers: Mutex<BTreeMap<Namespace, Arc<Follower>>>,
+    shelf: Shelf<J>,
     /// Frames declined; every thread may hold a lease of one, its owner is told once.
     declined: Mutex<BTreeSet<u64>>,
 }
@@ -181,13 +147,13 @@ pub struct Worker<J> {
 impl<J: Job> Worker<J> {
     /// A worker named `name` for the server behind `channel`.
     pub fn new(name: String, channel: tonic::transport::Channel) -> Self {
+        let cache = client::cache(channel.clone());
         Self {
             name,
-            cache: client::cache(channel.clone()),
+            shelf: Shelf::new(cache.clone()),
+            cache,
             frames: client::frames(channel),
             held: Mutex::default(),
-            loaded: Mutex::default(),
-            followers: Mutex::default(),
             declined: Mutex::default(),
         }
     }
@@ -297,28 +263,22 @@ impl<J: Job> Worker<J> {
     /// A lease from its records' arrival to its acknowledged end.
     async fn do_lease(self: &Arc<Self>, lease: &v1::Lease) -> Result<(), Fault> {
         let step = lease.step.clone().ok_or_else(|| Fault::Unfit("the server sent a lease without a step".into()))?;
-        let loaded = self.frame(lease.frame).await?;
-        let done = self.do_tiles(lease, &step, &loaded).await?;
-        let namespace = &loaded.draft;
-        let mut bytes_records = 0;
-        if !done.records.is_empty() {
-            let inserted = client::retry(|| {
-                let (mut cache, records) = (self.cache.clone(), done.records.clone());
-                async move { follow::insert(&mut cache, namespace, &records).await.map(tonic::Response::new) }
-            });
-            bytes_records = inserted.await.map_err(|status| match status.code() {
-                // The border found a record unsound: gathered again it would be the same.
-                Code::InvalidArgument => Fault::Unfit(format!("the server refused records: {}", status.message())),
-                _ => Fault::from(status),
-            })?;
-        }
-        let received = loaded.follower.as_ref().map_or(0, |f| f.take_received());
+        let (worker, id) = (self.clone(), lease.id);
+        let dropped: Dropped = Arc::new(move || !lock(&worker.held).contains(&id));
+        let ready = self.shelf.frame(lease.frame, || self.describe(lease.frame)).await?;
+        let (levels, sealing_seconds) = ready.levels(&step, &dropped).await?;
+        let (tiles, known) = (lease.tile_from..lease.tile_to, ready.known());
+        let work = Work { step: step.clone(), tiles, levels, known, dropped: dropped.clone() };
+        let done = ready.job.clone().run(work).await.map_err(Fault::Unfit)?;
+        let mut done = done.ok_or(Fault::Gone)?;
+        done.cpu_seconds += sealing_seconds;
+        let bytes_records = self.insert(&ready.draft, &done.records, &dropped).await?;
         let request = v1::CompleteRequest {
             worker: self.name.clone(),
             lease: lease.id,
             frame: lease.frame,
             gathered: done.records.len() as u64,
-            counts: done.counts(&step, bytes_records, received),
+            counts: done.counts(&step, bytes_records, ready.take_received()),
             tiles: done.tiles,
         };
         let completed = client::retry(|| {
@@ -331,95 +291,37 @@ impl<J: Job> Worker<J> {
         Ok(())
     }
 
-    /// The CPU work of a lease, off the runtime's threads.
-    async fn do_tiles(
-        self: &Arc<Self>,
-        lease: &v1::Lease,
-        step: &v1::Step,
-        loaded: &Arc<Loaded<J>>,
-    ) -> Result<Done, Fault> {
-        let (worker, id) = (self.clone(), lease.id);
-        let dropped: Dropped = Arc::new(move || !lock(&worker.held).contains(&id));
-        let digest = convert::digest(&step.sealed_digest).map_err(|e| Fault::Unfit(e.to_string()))?;
-        if let Some(follower) = &loaded.follower
-            && !follower.reaches(step.sealed_position, &*dropped).await
-        {
-            return Err(Fault::Gone);
-        }
-        let (ready, position) = (loaded.clone(), step.sealed_position);
-        let sealing = off_thread(move || match &ready.follower {
-            Some(follower) => {
-                let mut caches = lock(&ready.caches);
-                let part = follower.part(caches.position(), position)?;
-                caches.seal(&part, digest)
-            }
-            None => Ok(Vec::new()),
-        });
-        let levels = match sealing.await.map_err(Fault::Unfit)? {
-            Ok(levels) => levels,
-            Err(ReplicaError::Outdated { .. }) => return Err(Fault::Gone),
-            Err(e @ ReplicaError::Digest { .. }) => {
-                // The server may have come back with another log than the one followed so far.
-                warn!("{e}; following the server's log anew");
-                self.forget(lease.frame, loaded);
-                return Err(Fault::Gone);
-            }
-            Err(e) => return Err(Fault::Unfit(e.to_string())),
-        };
-        let known: Known = Arc::new(|_| None);
-        let work = Work { step: step.clone(), tiles: lease.tile_from..lease.tile_to, levels, known, dropped };
-        loaded.job.clone().run(work).await.map_err(Fault::Unfit)?.ok_or(Fault::Gone)
-    }
-
-    /// A frame made ready, once, whoever asks first.
-    async fn frame(self: &Arc<Self>, id: u64) -> Result<Arc<Loaded<J>>, Fault> {
-        let slot = {
-            let mut loaded = lock(&self.loaded);
-            let slot = match loaded.iter().position(|(known, _)| *known == id) {
-                Some(at) => loaded.remove(at).1,
-                None => Slot::default(),
-            };
-            loaded.push((id, slot.clone()));
-            if loaded.len() > FRAMES_KEPT {
-                loaded.remove(0);
-            }
-            let used: Vec<_> = loaded.iter().filter_map(|(_, s)| Some(s.get()?.draft)).collect();
-            // Frames evicted while in use keep their follower by themselves.
-            lock(&self.followers).retain(|namespace, _| used.contains(namespace));
-            slot
-        };
-        slot.get_or_try_init(|| self.load(id)).await.cloned()
-    }
-
-    async fn load(self: &Arc<Self>, id: u64) -> Result<Arc<Loaded<J>>, Fault> {
+    async fn describe(&self, frame: u64) -> Result<v1::DescribeResponse, Status> {
         let described = client::retry(|| {
             let mut frames = self.frames.clone();
-            async move { frames.describe(v1::DescribeRequest { frame: id }).await }
+            async move { frames.describe(v1::DescribeRequest { frame }).await }
         });
-        let described = described.await?;
-        let job = J::prepare(&described).await.map_err(Fault::Unfit)?;
-        let draft = convert::namespace(&described.draft).map_err(|e| Fault::Unfit(e.to_string()))?;
-        let start = || Arc::new(Follower::start(self.cache.clone(), draft));
-        let follower = (job.levels() > 0).then(|| lock(&self.followers).entry(draft).or_insert_with(start).clone());
-        let caches = Arc::new(Mutex::new(Caches::new(job.a(), job.levels())));
-        Ok(Arc::new(Loaded { job: Arc::new(job), draft, follower, caches }))
+        described.await
     }
 
-    /// Makes the next lease of a frame start over with an empty replica.
-    fn forget(&self, frame: u64, loaded: &Arc<Loaded<J>>) {
-        let mut frames = lock(&self.loaded);
-        // Another thread may have done so already, and a new one be on its way.
-        frames.retain(|(id, slot)| *id != frame || !slot.get().is_some_and(|l| Arc::ptr_eq(l, loaded)));
-        let mut followers = lock(&self.followers);
-        let namespace = &loaded.draft;
-        let same = |f: &Arc<Follower>| loaded.follower.as_ref().is_some_and(|mine| Arc::ptr_eq(f, mine));
-        if followers.get(namespace).is_some_and(same) {
-            followers.remove(namespace);
+    /// Inserts what a lease gathered; says how many bytes of records it sent. A server that has no room, or is away, is
+    /// asked again as long as the lease is ours.
+    async fn insert(&self, draft: &Namespace, records: &[(Tag, Irradiance)], dropped: &Dropped) -> Result<u64, Fault> {
+        if records.is_empty() {
+            return Ok(0);
+        }
+        let mut backoff = Backoff::default();
+        loop {
+            let inserted = client::retry_for(Duration::ZERO, || {
+                let mut cache = self.cache.clone();
+                async move { follow::insert(&mut cache, draft, records).await.map(tonic::Response::new) }
+            });
+            match inserted.await {
+                Ok(kept) => return Ok(kept.bytes),
+                Err(_) if dropped() => return Err(Fault::Gone),
+                Err(status) if follow::is_worth_repeating(&status) => warn!("records wait: {}", status.message()),
+                // The border found a record unsound: gathered again it would be the same.
+                Err(status) if status.code() == Code::InvalidArgument => {
+                    return Err(Fault::Unfit(format!("the server refused records: {}", status.message())));
+                }
+                Err(status) => return Err(status.into()),
+            }
+            backoff.wait().await;
         }
     }
-}
-
-/// A panic while holding one of these locks has been reported by then.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

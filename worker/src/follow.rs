@@ -1,28 +1,49 @@
-//! Keeps a [`Replica`] following the server's log of its namespace.
+//! Keeps a [`Replica`] following the server's log of its namespace, and gives back to the server what it lost.
 
+use std::pin::pin;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use cache_core::{Irradiance, Namespace, Tag};
+use cache_core::{Irradiance, Namespace, RecordId, Tag};
 use cache_proto::{convert, v1};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tonic::{Code, Status};
-use tracing::{debug, warn};
+use tracing::{debug, info, warn};
 
-use crate::client::{Backoff, Cache};
-use crate::replica::{Part, Replica, ReplicaError};
+use crate::client::{self, Backoff, Cache};
+use crate::job::Dropped;
+use crate::replica::Replica;
+use crate::threads::{lock, off_thread};
 
 /// How often someone who waits for records looks whether that is still of use.
 const LOOK: Duration = Duration::from_millis(200);
 
 /// A replica and the task that feeds it. Dropping it ends the subscription.
 pub struct Follower {
-    replica: Arc<Mutex<Replica>>,
-    position: watch::Receiver<u64>,
+    held: Arc<Mutex<Held>>,
+    reached: watch::Receiver<Reached>,
+    /// The last epoch whose log is not to be followed any more.
+    left: watch::Sender<u64>,
     received: Arc<AtomicU64>,
     task: JoinHandle<()>,
+}
+
+/// All that is held of a namespace.
+struct Held {
+    replica: Replica,
+    /// What the logs before this one held, until the server has it again.
+    aside: Option<Replica>,
+}
+
+/// How far a replica is.
+#[derive(Clone, Default)]
+struct Reached {
+    epoch: u64,
+    position: u64,
+    /// The server does not let us read the namespace.
+    refused: Option<Status>,
 }
 
 impl Drop for Follower {
@@ -34,11 +55,13 @@ impl Drop for Follower {
 impl Follower {
     /// Subscribes to `namespace`.
     pub fn start(cache: Cache, namespace: Namespace) -> Self {
-        let replica = Arc::new(Mutex::new(Replica::new(namespace)));
-        let (sender, position) = watch::channel(0);
+        let held = Arc::new(Mutex::new(Held { replica: Replica::new(namespace), aside: None }));
+        let (sender, reached) = watch::channel(Reached { epoch: 1, ..Reached::default() });
+        let (left, leaving) = watch::channel(0);
         let received = Arc::new(AtomicU64::new(0));
-        let feed = Feed { cache, namespace, replica: replica.clone(), position: sender, received: received.clone() };
-        Self { replica, position, received, task: tokio::spawn(feed.run()) }
+        let feed =
+            Feed { cache, namespace, held: held.clone(), reached: sender, left: leaving, received: received.clone() };
+        Self { held, reached, left, received, task: tokio::spawn(feed.run()) }
     }
 
     /// Bytes of records received since the last call.
@@ -47,40 +70,62 @@ impl Follower {
     }
 
     /// Waits until the log reaches `position`: true. Gives up with false when `dropped` says that nobody waits.
-    pub async fn reaches(&self, position: u64, dropped: impl Fn() -> bool) -> bool {
-        let mut here = self.position.clone();
-        while *here.borrow_and_update() < position {
+    ///
+    /// # Errors
+    /// The server does not let us read the namespace.
+    pub async fn reaches(&self, position: u64, dropped: &Dropped) -> Result<bool, Status> {
+        let mut here = self.reached.clone();
+        loop {
+            {
+                let now = here.borrow_and_update();
+                if let Some(status) = &now.refused {
+                    return Err(status.clone());
+                }
+                // What is to be left does not count.
+                if now.epoch > *self.left.borrow() && now.position >= position {
+                    return Ok(true);
+                }
+            }
             if dropped() {
-                return false;
+                return Ok(false);
             }
             // Ran out of time, or the subscription ended for good: look again, at the same pace.
             if let Ok(Err(_)) = tokio::time::timeout(LOOK, here.changed()).await {
                 tokio::time::sleep(LOOK).await;
             }
         }
-        true
     }
 
-    /// As [`Replica::part`]. Takes CPU time: not for the runtime's threads.
-    ///
-    /// # Errors
-    /// As [`Replica::part`].
-    pub fn part(&self, from: u64, to: u64) -> Result<Part, ReplicaError> {
-        lock(&self.replica).part(from, to)
+    /// Follows the server's log from its beginning, if the one that is followed now is of `epoch`: it is not what the
+    /// server has.
+    pub fn leave(&self, epoch: u64) {
+        self.left.send_if_modified(|left| {
+            epoch > *left && {
+                *left = epoch;
+                true
+            }
+        });
     }
-}
 
-/// A panic elsewhere cannot leave a replica half changed in a way that matters: digests are checked.
-fn lock(replica: &Mutex<Replica>) -> MutexGuard<'_, Replica> {
-    replica.lock().unwrap_or_else(PoisonError::into_inner)
+    /// Looks at the replica. The subscription waits as long.
+    pub fn read<T>(&self, look: impl FnOnce(&Replica) -> T) -> T {
+        look(&lock(&self.held).replica)
+    }
+
+    /// The record of an id, from this log or one before it.
+    pub fn known(&self, id: RecordId) -> Option<Irradiance> {
+        let held = lock(&self.held);
+        held.replica.get(id).or_else(|| held.aside.as_ref()?.get(id))
+    }
 }
 
 /// The subscription's side.
 struct Feed {
     cache: Cache,
     namespace: Namespace,
-    replica: Arc<Mutex<Replica>>,
-    position: watch::Sender<u64>,
+    held: Arc<Mutex<Held>>,
+    reached: watch::Sender<Reached>,
+    left: watch::Receiver<u64>,
     received: Arc<AtomicU64>,
 }
 
@@ -90,53 +135,155 @@ impl Feed {
     async fn run(mut self) {
         let mut backoff = Backoff::default();
         loop {
-            let before = *self.position.borrow();
-            let end = self.subscribe().await;
-            if *self.position.borrow() != before {
-                backoff = Backoff::default();
-            }
-            match end {
-                Ok(()) => debug!("the server ended the subscription"),
-                Err(status) if status.code() == Code::OutOfRange => {
-                    // Records of an interrupted frame would change the one begun in its place: follow the new log.
-                    warn!("the server lost its records, beginning anew: {}", status.message());
-                    *lock(&self.replica) = Replica::new(self.namespace);
-                    self.position.send_replace(0);
+            let before = self.here();
+            match self.subscribe().await {
+                Ok(()) => debug!("the subscription ended"),
+                Err(status) if matches!(status.code(), Code::PermissionDenied | Code::Unauthenticated) => {
+                    return self.reached.send_modify(|reached| reached.refused = Some(status));
                 }
                 Err(status) => debug!("subscription ended: {status}"),
+            }
+            if self.here() != before {
+                backoff = Backoff::default();
             }
             backoff.wait().await;
         }
     }
 
+    fn here(&self) -> (u64, u64) {
+        let reached = self.reached.borrow();
+        (reached.epoch, reached.position)
+    }
+
     async fn subscribe(&mut self) -> Result<(), Status> {
-        let position = *self.position.borrow();
-        let request =
-            v1::SubscribeRequest { namespace: self.namespace.0.to_vec().into(), position, ..Default::default() };
-        let mut stream = self.cache.subscribe(request).await?.into_inner();
-        while let Some(response) = stream.message().await? {
-            let Some(batch) = response.batch else { continue };
-            self.received.fetch_add(batch.records.len() as u64, Ordering::Relaxed);
-            let replica = self.replica.clone();
-            // Off the runtime: checking takes CPU time, and others hold the lock while they copy.
-            let applied = tokio::task::spawn_blocking(move || lock(&replica).apply(response.position, &batch));
-            let applied = applied.await.map_err(|e| Status::internal(e.to_string()))?;
-            let position = applied.map_err(|e| {
-                warn!("{e}");
-                Status::internal(e.to_string())
-            })?;
-            self.position.send_replace(position);
+        let left = *self.left.borrow_and_update();
+        if left == self.here().0 {
+            self.set_aside();
         }
+        let (position, digest) = {
+            let held = lock(&self.held);
+            (held.replica.position(), convert::digest_bytes(held.replica.digest()))
+        };
+        let request = v1::SubscribeRequest { namespace: self.namespace.0.to_vec().into(), position, digest };
+        let mut stream = self.cache.subscribe(request).await?.into_inner();
+        let Some(first) = stream.message().await? else { return Ok(()) };
+        match first.position {
+            _ if first.batch.is_some() => return Err(Status::internal("the stream does not say where it starts")),
+            start if start == position => {}
+            0 => {
+                warn!("the server has another log now, following it from its beginning");
+                self.set_aside();
+            }
+            start => return Err(Status::internal(format!("the stream starts at {start}, asked for {position}"))),
+        }
+        let mut refilling = lock(&self.held).aside.is_some();
+        let refill = refill(self.cache.clone(), self.namespace, self.held.clone(), self.reached.subscribe(), first.end);
+        let mut refill = pin!(refill);
+        loop {
+            tokio::select! {
+                biased;
+                Ok(()) = self.left.changed() => return Ok(()),
+                () = &mut refill, if refilling => refilling = false,
+                response = stream.message() => match response? {
+                    Some(response) => self.apply(response).await?,
+                    None => return Ok(()),
+                }
+            }
+        }
+    }
+
+    async fn apply(&self, response: v1::SubscribeResponse) -> Result<(), Status> {
+        let Some(batch) = response.batch else { return Ok(()) };
+        self.received.fetch_add(batch.records.len() as u64, Ordering::Relaxed);
+        let held = self.held.clone();
+        // Checking takes CPU time, and others hold the lock while they copy.
+        let applied = off_thread(move || lock(&held).replica.apply(response.position, &batch)).await;
+        let position = applied.map_err(Status::internal)?.map_err(|e| {
+            warn!("{e}");
+            Status::internal(e.to_string())
+        })?;
+        self.reached.send_modify(|reached| reached.position = position);
         Ok(())
+    }
+
+    fn set_aside(&self) {
+        let mut held = lock(&self.held);
+        let old = held.replica.set_aside();
+        match &mut held.aside {
+            Some(aside) => aside.unite(&old),
+            None => held.aside = Some(old),
+        }
+        let epoch = held.replica.epoch();
+        self.reached.send_modify(|reached| (reached.epoch, reached.position) = (epoch, 0));
     }
 }
 
-/// Inserts records, each tag's in batches, and waits until the server keeps them. Says how many bytes of
-/// records it sent. Repeating it is harmless.
+/// Gives the server what earlier logs held and this one does not, once it has been read up to `end`.
+async fn refill(
+    mut cache: Cache,
+    namespace: Namespace,
+    held: Arc<Mutex<Held>>,
+    mut reached: watch::Receiver<Reached>,
+    mut end: u64,
+) {
+    let mut backoff = Backoff::default();
+    loop {
+        if reached.wait_for(|reached| reached.position >= end).await.is_err() {
+            return;
+        }
+        let mut from = 0;
+        // Looked up before each batch: others hold the same records and give them back at the same time.
+        while let Some((records, next)) = lacking(&held, from).await {
+            match insert(&mut cache, &namespace, &records).await {
+                Ok(kept) => {
+                    info!(records = records.len(), "gave back to the server");
+                    (from, end, backoff) = (next, kept.position, Backoff::default());
+                }
+                Err(status) if is_worth_repeating(&status) => {
+                    debug!("{status}");
+                    backoff.wait().await;
+                }
+                Err(status) => {
+                    warn!("the server does not take back what it lost: {}", status.message());
+                    lock(&held).aside = None;
+                    return;
+                }
+            }
+        }
+        if from == 0 {
+            lock(&held).aside = None;
+            return;
+        }
+    }
+}
+
+async fn lacking(held: &Arc<Mutex<Held>>, from: usize) -> Option<(Vec<(Tag, Irradiance)>, usize)> {
+    let held = held.clone();
+    let looking = off_thread(move || {
+        let held = lock(&held);
+        held.aside.as_ref()?.lacking(&held.replica, from, convert::BATCH_RECORDS_MAX)
+    });
+    looking.await.ok()?
+}
+
+/// What became of inserted records.
+pub struct Kept {
+    /// Bytes of records sent.
+    pub bytes: u64,
+    /// Length of the server's log after them.
+    pub position: u64,
+}
+
+/// Whether an insert that failed so may succeed later: the server is away, or has no room for now.
+pub fn is_worth_repeating(status: &Status) -> bool {
+    client::is_passing(status) || status.code() == Code::ResourceExhausted
+}
+
+/// Inserts records, each tag's in batches, and waits until the server keeps them. Repeating it is harmless.
 ///
 /// # Errors
 /// The server's.
-pub async fn insert(cache: &mut Cache, namespace: &Namespace, records: &[(Tag, Irradiance)]) -> Result<u64, Status> {
+pub async fn insert(cache: &mut Cache, namespace: &Namespace, records: &[(Tag, Irradiance)]) -> Result<Kept, Status> {
     let mut batches = Vec::new();
     for run in records.chunk_by(|a, b| a.0 == b.0) {
         for part in run.chunks(convert::BATCH_RECORDS_MAX) {
@@ -145,6 +292,6 @@ pub async fn insert(cache: &mut Cache, namespace: &Namespace, records: &[(Tag, I
         }
     }
     let bytes = batches.iter().flat_map(|b| &b.batch).map(|b| b.records.len() as u64).sum();
-    cache.insert(tokio_stream::iter(batches)).await?;
-    Ok(bytes)
+    let response = cache.insert(tokio_stream::iter(batches)).await?.into_inner();
+    Ok(Kept { bytes, position: response.position })
 }

@@ -8,7 +8,6 @@ use std::sync::Arc;
 
 use cache_core::{Irradiance, RecordId};
 use cache_proto::v1;
-use tokio::runtime::{Handle, RuntimeFlavor};
 
 use crate::frame::Levels;
 use crate::task::Done;
@@ -53,16 +52,4 @@ pub struct Work {
     pub known: Known,
     /// To be asked now and then.
     pub dropped: Dropped,
-}
-
-/// Does what takes CPU time where it holds up nobody: on a thread of its own, or in place on a runtime that has only
-/// one, so that a simulation stays in order.
-///
-/// # Errors
-/// It panicked.
-pub async fn off_thread<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, String> {
-    match Handle::current().runtime_flavor() {
-        RuntimeFlavor::CurrentThread => Ok(work()),
-        _ => tokio::task::spawn_blocking(work).await.map_err(|panic| format!("the worker failed: {panic}")),
-    }
 }

@@ -16,11 +16,14 @@
 //! - [`solo`]: a frame without a farm.
 //! - [`spec`]: settings on the wire.
 //! - [`client`]: the connection to a server.
-//! - [`replica`]: a copy of a namespace's log, and the caches sealed from a prefix of it.
-//! - [`follow`]: keeps a replica following the server.
+//! - [`replica`]: a copy of a namespace's log.
+//! - [`caches`]: what a step may read, sealed: a prefix of one log, lower steps of another.
+//! - [`follow`]: keeps a replica following the server, and gives back what the server lost.
 //! - [`job`]: the seam between the protocol and the work.
 //! - [`task`]: the renderer's job.
+//! - [`ready`]: frames made ready.
 //! - [`farm`]: the worker process.
+//! - [`threads`]: work off the runtime's threads.
 //! - [`film`]: tiles become OUT.exr and OUT.png.
 //! - [`compare`]: how far a picture is from a reference.
 //! - [`math`]: functions whose bits are the same everywhere.
@@ -44,13 +47,16 @@ pub mod frame;
 
 pub mod solo;
 
+pub mod caches;
 pub mod client;
 pub mod farm;
 pub mod follow;
 pub mod job;
+pub mod ready;
 pub mod replica;
 pub mod spec;
 pub mod task;
+pub mod threads;
 
 pub mod compare;
 pub mod film;

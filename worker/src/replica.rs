@@ -1,16 +1,13 @@
-//! A worker's copy of one namespace, and the sealed caches of exactly the part of it that a step may read.
+//! A worker's copy of one namespace's log.
 
-use std::collections::{HashMap, HashSet};
-use std::sync::Arc;
+use std::collections::{BTreeMap, HashSet};
 
 use cache_core::id::Digest;
 use cache_core::set::Inserted;
-use cache_core::{Irradiance, Namespace, RecordId, RecordSet, Sealed, Tag};
+use cache_core::{Irradiance, Namespace, RecordId, RecordSet, Tag};
 use cache_proto::{convert, v1};
 
-use crate::frame::Levels;
-
-/// Why a replica could not take a batch or give its caches.
+/// Why a replica could not take a batch or give a part of its log.
 #[derive(Clone, PartialEq, Debug, thiserror::Error)]
 pub enum ReplicaError {
     /// A batch that is not sound, or not of this namespace.
@@ -27,48 +24,83 @@ pub enum ReplicaError {
     /// The server's log holds a record that changes nothing, so positions would disagree.
     #[error("the server's log repeats a record at position {0}")]
     Repeated(u64),
-    /// Asked for a position before what was already sealed: the lease is of a step long done.
-    #[error("lease outdated: it reads up to position {asked}, sealed already up to {sealed}")]
+    /// Asked for less than was sealed before: the lease is of a step long done.
+    #[error("lease outdated: its step is {asked}, sealed already for step {sealed}")]
     Outdated {
-        /// What the lease reads up to.
-        asked: u64,
-        /// What is sealed here.
-        sealed: u64,
+        /// Step of the lease.
+        asked: u32,
+        /// Step the caches are sealed for.
+        sealed: u32,
     },
     /// Asked for a position that has not arrived yet.
     #[error("position {asked} has not arrived, the log ends at {have}")]
     Behind {
-        /// What the lease reads up to.
+        /// What is asked for.
         asked: u64,
         /// Where the log ends here.
         have: u64,
     },
-    /// The records up to the position are not those the server sealed.
-    #[error("records up to position {position} have digest {got:032x}, the server sealed {expected:032x}")]
+    /// The records up to the position are not those the server means.
+    #[error("records up to position {position} have digest {got:032x}, the server's have {expected:032x}")]
     Digest {
+        /// Epoch of the log here.
+        epoch: u64,
         /// The position.
         position: u64,
         /// Digest here.
         got: u128,
-        /// Digest in the step.
+        /// Digest there.
         expected: u128,
     },
 }
 
+/// How much of a draft's log is in some caches: of the log of `epoch`, below `position`, the records of steps below
+/// `step`. The default is nothing of any log.
+#[derive(Clone, Copy, PartialEq, Eq, Default, Debug)]
+pub struct Mark {
+    /// Which log: they count from 1.
+    pub epoch: u64,
+    /// Below which position.
+    pub position: u64,
+    /// Below which step.
+    pub step: u32,
+}
+
+/// Records on their way from a log into caches.
+#[derive(Clone, Default, Debug)]
+pub struct Part {
+    /// Whence they lead, with what is in the caches already.
+    pub to: Mark,
+    /// These are all records: the caches start over.
+    pub anew: bool,
+    /// The records, each id once.
+    pub records: Vec<(Tag, Irradiance)>,
+}
+
 /// A copy of a namespace's log.
 ///
-/// Invariant: it is a prefix of the server's, entry by entry.
+/// Invariant: it is a prefix of the server's, entry by entry, unless the server has another log than before; then this
+/// one is set aside ([`Self::set_aside`]) and the next begins.
+#[derive(Clone, Debug)]
 pub struct Replica {
     namespace: Namespace,
+    epoch: u64,
     set: RecordSet<Irradiance>,
-    /// Positions whose record took the place of an earlier one.
-    replaced: HashSet<usize>,
+    /// Positions whose record took the place of an earlier one, and the position of that one.
+    replaced: BTreeMap<usize, usize>,
+    /// Positions of each step's records, ascending.
+    steps: BTreeMap<u32, Vec<usize>>,
 }
 
 impl Replica {
-    /// An empty copy.
+    /// An empty copy, of epoch 1.
     pub fn new(namespace: Namespace) -> Self {
-        Self { namespace, set: RecordSet::default(), replaced: HashSet::new() }
+        Self { namespace, epoch: 1, set: RecordSet::default(), replaced: BTreeMap::new(), steps: BTreeMap::new() }
+    }
+
+    /// Which of the logs followed so far this is.
+    pub fn epoch(&self) -> u64 {
+        self.epoch
     }
 
     /// Where the next batch should begin.
@@ -76,9 +108,14 @@ impl Replica {
         self.set.position() as u64
     }
 
-    /// All records with their levels, in the order of the log.
-    pub fn log(&self) -> &[(Tag, Irradiance)] {
-        self.set.since(0)
+    /// Digest of all records.
+    pub fn digest(&self) -> Digest {
+        self.set.digest()
+    }
+
+    /// The record of an id.
+    pub fn get(&self, id: RecordId) -> Option<Irradiance> {
+        self.set.get(id).map(|(_, record)| *record)
     }
 
     /// Takes a batch of the subscription whose first record stands at `position`; says where the next one begins. What
@@ -96,235 +133,252 @@ impl Replica {
             return Err(ReplicaError::Gap { expected: self.position(), got: position });
         };
         for record in records.into_iter().skip(usize::try_from(known).unwrap_or(usize::MAX)) {
-            let at = self.set.position();
-            match self.set.insert(tag, record) {
-                Inserted::Added => {}
-                Inserted::Replaced => drop(self.replaced.insert(at)),
-                Inserted::Known => return Err(ReplicaError::Repeated(at as u64)),
+            if self.insert(tag, record) == Inserted::Known {
+                return Err(ReplicaError::Repeated(self.position()));
             }
         }
         Ok(self.position())
     }
 
-    /// What caches that were sealed at position `from` need to be sealed at `to`.
+    fn insert(&mut self, tag: Tag, record: Irradiance) -> Inserted {
+        let (at, earlier) = (self.set.position(), self.set.position_of(record.id));
+        let inserted = self.set.insert(tag, record);
+        if inserted != Inserted::Known {
+            self.steps.entry(tag.step).or_default().push(at);
+            self.replaced.extend(earlier.map(|earlier| (at, earlier)));
+        }
+        inserted
+    }
+
+    /// All records below `position`.
     ///
     /// # Errors
-    /// [`ReplicaError::Outdated`] when `to` lies before `from`, [`ReplicaError::Behind`] when it has not arrived.
-    pub fn part(&self, from: u64, to: u64) -> Result<Part, ReplicaError> {
-        if to < from {
-            return Err(ReplicaError::Outdated { asked: to, sealed: from });
+    /// [`ReplicaError::Behind`].
+    pub fn prefix(&self, position: u64) -> Result<Part, ReplicaError> {
+        let end = self.arrived(position)?;
+        let to = Mark { epoch: self.epoch, position, step: 0 };
+        Ok(Part { to, anew: true, records: self.at(end, 0..end) })
+    }
+
+    /// What caches sealed at `from` need to hold the records below `position` of steps below `step`.
+    ///
+    /// # Errors
+    /// [`ReplicaError::Outdated`] when that is less than they hold, [`ReplicaError::Behind`] when it has not arrived.
+    pub fn part(&self, from: Mark, position: u64, step: u32) -> Result<Part, ReplicaError> {
+        let followed = from.epoch == self.epoch;
+        if followed && (position < from.position || step < from.step) {
+            return Err(ReplicaError::Outdated { asked: step, sealed: from.step });
         }
-        if to > self.position() {
-            return Err(ReplicaError::Behind { asked: to, have: self.position() });
-        }
-        // Both are at most the log's length.
-        let range = from as usize..to as usize;
+        let end = self.arrived(position)?;
         // A sealed cache can only grow, and what was replaced may be in one.
-        let anew = range.clone().any(|at| self.replaced.contains(&at));
-        let records = if anew { latest(&self.log()[..range.end]) } else { self.log()[range].to_vec() };
-        Ok(Part { to, anew, records })
-    }
-}
-
-/// Records to add to sealed caches.
-#[derive(Clone, Debug)]
-pub struct Part {
-    to: u64,
-    /// These are all records: start from empty caches.
-    anew: bool,
-    records: Vec<(Tag, Irradiance)>,
-}
-
-/// The caches of one frame, sealed from a prefix of its namespace's log.
-///
-/// Frames that share a namespace share its [`Replica`], but each has its own caches: their steps read different
-/// prefixes at the same time.
-///
-/// Invariant: the caches are made of the log below `position` and of nothing after.
-pub struct Caches {
-    a: f32,
-    levels: Levels,
-    position: u64,
-    digest: Digest,
-}
-
-impl Caches {
-    /// Empty caches that count with the allowed error `a`, one for each of `levels` levels. Records of deeper levels,
-    /// which another client may have shared, go into none.
-    pub fn new(a: f32, levels: u32) -> Self {
-        let levels = (0..levels).map(|_| Arc::new(Sealed::new(a))).collect();
-        Self { a, levels, position: 0, digest: Digest::default() }
+        let anew = !followed || self.replaced.range(from.position as usize..end).next().is_some();
+        let from = if anew { Mark::default() } else { from };
+        let begin = from.position as usize;
+        let log = self.set.since(0);
+        let waited =
+            self.steps.range(from.step..step).flat_map(|(_, of_step)| of_step).copied().filter(|at| *at < begin);
+        let came = (begin..end).filter(|at| log[*at].0.step < step);
+        let to = Mark { epoch: self.epoch, position, step };
+        Ok(Part { to, anew, records: self.at(end, waited.chain(came)) })
     }
 
-    /// Up to where the log is in the caches.
-    pub fn position(&self) -> u64 {
-        self.position
+    fn arrived(&self, position: u64) -> Result<usize, ReplicaError> {
+        if position > self.position() {
+            return Err(ReplicaError::Behind { asked: position, have: self.position() });
+        }
+        Ok(position as usize)
     }
 
-    /// Adds a part of the log that begins at [`Self::position`]; all records up to its end must have `digest`.
-    ///
-    /// # Errors
-    /// [`ReplicaError::Digest`]; nothing changes then.
-    pub fn seal(&mut self, part: &Part, digest: Digest) -> Result<Levels, ReplicaError> {
-        let mut united = if part.anew { Digest::default() } else { self.digest };
-        for (_, record) in &part.records {
-            united.add(record.id);
+    /// The entries at `positions`, but those that another one below `end` replaced.
+    fn at(&self, end: usize, positions: impl Iterator<Item = usize>) -> Vec<(Tag, Irradiance)> {
+        let gone: HashSet<usize> = self.replaced.range(..end).map(|(_, earlier)| *earlier).collect();
+        let log = self.set.since(0);
+        positions.filter(|at| !gone.contains(at)).map(|at| log[at]).collect()
+    }
+
+    /// Gives the log away, for an empty one of the next epoch.
+    pub fn set_aside(&mut self) -> Self {
+        let next = Self { epoch: self.epoch + 1, ..Self::new(self.namespace) };
+        std::mem::replace(self, next)
+    }
+
+    /// Adds what another copy holds besides, in its order.
+    pub fn unite(&mut self, other: &Self) {
+        for (tag, record) in other.set.since(0) {
+            self.insert(*tag, *record);
         }
-        if united != digest {
-            return Err(ReplicaError::Digest { position: part.to, got: united.0, expected: digest.0 });
-        }
-        if part.anew {
-            self.levels.fill_with(|| Arc::new(Sealed::new(self.a)));
-        }
-        for (level, sealed) in (1..).zip(&mut self.levels) {
-            let of_level: Vec<_> = part.records.iter().filter(|(t, _)| t.level == level).map(|(_, r)| *r).collect();
-            if !of_level.is_empty() {
-                Arc::make_mut(sealed).extend(of_level);
+    }
+
+    /// The next records, from position `from` of this log on, that `other` lacks: in the order of this log, at most
+    /// `most` (not 0); and where to look next. `None`: it lacks none.
+    pub fn lacking(&self, other: &Self, from: usize, most: usize) -> Option<(Vec<(Tag, Irradiance)>, usize)> {
+        let (mut records, mut next) = (Vec::new(), from);
+        for (at, (_, record)) in self.set.since(from).iter().enumerate().map(|(i, entry)| (from + i, entry)) {
+            next = at + 1;
+            // Each id where it first stood, so that prefixes hold the same ids again, with the entry that counts.
+            if self.replaced.contains_key(&at) || other.set.get(record.id).is_some() {
+                continue;
+            }
+            records.extend(self.set.get(record.id));
+            if records.len() == most {
+                break;
             }
         }
-        (self.position, self.digest) = (part.to, united);
-        Ok(self.levels.clone())
+        (!records.is_empty()).then_some((records, next))
     }
-}
-
-/// Each id's last entry in a piece of the log, which is the one that counts.
-fn latest(log: &[(Tag, Irradiance)]) -> Vec<(Tag, Irradiance)> {
-    let last: HashMap<RecordId, usize> = log.iter().enumerate().map(|(at, (_, r))| (r.id, at)).collect();
-    log.iter().enumerate().filter(|(at, (_, r))| last[&r.id] == *at).map(|(_, entry)| *entry).collect()
 }
 
 #[cfg(test)]
-mod tests {
-    use cache_core::Query;
+pub(crate) mod tests {
     use glam::{Vec2, Vec3};
     use proptest::prelude::*;
 
     use super::*;
 
-    const NAMESPACE: Namespace = Namespace([7; 32]);
+    pub(crate) const NAMESPACE: Namespace = Namespace([7; 32]);
 
-    /// Few ids, so that replacements are common; the same level for an id mostly.
-    fn entries() -> impl Strategy<Value = Vec<(Tag, Irradiance)>> {
-        let one =
-            (0u128..24, 1u32..4, prop::array::uniform3(0f32..2.0), 0.2f32..2.0).prop_map(|(id, level, p, radius)| {
-                let record = Irradiance {
-                    id: RecordId(id << 64 | id),
-                    position: Vec3::from(p),
-                    normal: Vec3::Z,
-                    radius,
-                    radius_min: 0.1,
-                    radius_max: 3.0,
-                    irradiance: Vec3::from(p) + 1.0,
-                    gradient_t: [Vec2::ZERO; 3],
-                    gradient_r: [Vec2::ZERO; 3],
-                };
-                (Tag::level(level), record)
-            });
-        prop::collection::vec(one, 1..40)
-    }
-
-    /// The server's side: its log and the digest of every prefix.
-    fn server(entries: &[(Tag, Irradiance)]) -> (Vec<(Tag, Irradiance)>, Vec<Digest>) {
-        let (mut set, mut digests) = (RecordSet::default(), vec![Digest::default()]);
-        for (tag, record) in entries {
-            if set.insert(*tag, *record) != Inserted::Known {
-                digests.push(set.digest());
-            }
+    pub(crate) fn record(id: u128, position: Vec3, radius: f32) -> Irradiance {
+        Irradiance {
+            id: RecordId(id << 64 | id),
+            position,
+            normal: Vec3::Z,
+            radius,
+            radius_min: 0.1,
+            radius_max: 3.0,
+            irradiance: position + 1.0,
+            gradient_t: [Vec2::ZERO; 3],
+            gradient_r: [Vec2::ZERO; 3],
         }
-        (set.since(0).to_vec(), digests)
     }
 
-    fn feed(replica: &mut Replica, log: &[(Tag, Irradiance)], from: usize) {
-        for (at, (tag, record)) in log.iter().enumerate().skip(from) {
+    /// Few ids, so that replacements are common; steps in any order, as leftovers of an interrupted attempt are.
+    pub(crate) fn entries() -> impl Strategy<Value = Vec<(Tag, Irradiance)>> {
+        let one = (0u128..24, 1u32..4, 0u32..4, prop::array::uniform3(0f32..2.0), 0.2f32..2.0)
+            .prop_map(|(id, level, step, p, radius)| (Tag { level, step }, record(id, Vec3::from(p), radius)));
+        prop::collection::vec(one, 0..40)
+    }
+
+    /// The server's log after these came.
+    pub(crate) fn server(entries: &[(Tag, Irradiance)]) -> Vec<(Tag, Irradiance)> {
+        let mut set = RecordSet::default();
+        for (tag, record) in entries {
+            set.insert(*tag, *record);
+        }
+        set.since(0).to_vec()
+    }
+
+    pub(crate) fn feed(replica: &mut Replica, log: &[(Tag, Irradiance)]) {
+        for (at, (tag, record)) in log.iter().enumerate() {
             replica.apply(at as u64, &convert::pack(&NAMESPACE, *tag, [record])).expect("sound batch");
         }
     }
 
-    /// Bits of the answers of both levels on a grid of points.
-    fn answers(levels: &Levels) -> Vec<Option<[u32; 3]>> {
-        let points = (0..27).map(|i| Vec3::new((i % 3) as f32, (i / 3 % 3) as f32, (i / 9) as f32) * 0.9);
-        points
-            .flat_map(|position| {
-                let query = Query { position, normal: Vec3::Z };
-                levels.iter().map(move |l| l.ask(&query).map(|a| a.irradiance.to_array().map(f32::to_bits)))
-            })
-            .collect()
+    pub(crate) fn replica(log: &[(Tag, Irradiance)]) -> Replica {
+        let mut replica = Replica::new(NAMESPACE);
+        feed(&mut replica, log);
+        replica
+    }
+
+    /// Each id's last entry in a piece of the log, which is the one that counts.
+    pub(crate) fn latest(log: &[(Tag, Irradiance)]) -> Vec<(Tag, Irradiance)> {
+        let counts = |at: usize| log[at + 1..].iter().all(|(_, later)| later.id != log[at].1.id);
+        (0..log.len()).filter(|at| counts(*at)).map(|at| log[at]).collect()
+    }
+
+    pub(crate) fn digest(records: &[(Tag, Irradiance)]) -> Digest {
+        let mut digest = Digest::default();
+        records.iter().for_each(|(_, r)| digest.add(r.id));
+        digest
     }
 
     proptest! {
-        /// However much of the log arrived, in whatever steps it was sealed before: the caches are those of the prefix.
-        #[test]
-        fn caches_are_exactly_those_of_the_prefix(entries in entries(), cuts in prop::collection::vec(0usize..40, 0..5), end in 0usize..40) {
-            let (log, digests) = server(&entries);
-            let end = end.min(log.len());
-            let mut steps: Vec<_> = cuts.into_iter().map(|c| c.min(end)).collect();
-            steps.sort_unstable();
-            steps.push(end);
-
-            let (mut lived, mut caches) = (Replica::new(NAMESPACE), Caches::new(0.8, 2));
-            feed(&mut lived, &log, 0);
-            let mut last = Levels::new();
-            for step in steps {
-                let part = lived.part(caches.position(), step as u64).expect("arrived");
-                last = caches.seal(&part, digests[step]).expect("same records");
-            }
-            let mut expected: Levels = (0..2).map(|_| Arc::new(Sealed::new(0.8))).collect();
-            for (tag, record) in latest(&log[..end]) {
-                if let Some(sealed) = expected.get_mut(tag.level as usize - 1) {
-                    Arc::make_mut(sealed).extend([record]);
-                }
-            }
-            prop_assert_eq!(answers(&last), answers(&expected));
-            let counts = |levels: &Levels| levels.iter().map(|l| (l.len(), l.digest())).collect::<Vec<_>>();
-            prop_assert_eq!(counts(&last), counts(&expected));
-        }
-
         /// Batches that come again, whole or in part, change nothing.
         #[test]
         fn repeated_batches_are_skipped(entries in entries(), again in 0usize..40) {
-            let (log, digests) = server(&entries);
-            let mut replica = Replica::new(NAMESPACE);
-            feed(&mut replica, &log, 0);
-            feed(&mut replica, &log, again.min(log.len()));
+            let log = server(&entries);
+            let mut replica = replica(&log);
+            feed(&mut replica, &log[..again.min(log.len())]);
             prop_assert_eq!(replica.position(), log.len() as u64);
-            let part = replica.part(0, replica.position()).expect("arrived");
-            prop_assert!(Caches::new(0.8, 2).seal(&part, digests[log.len()]).is_ok());
+            prop_assert_eq!(replica.digest(), digest(&latest(&log)));
+            let all = replica.prefix(replica.position()).expect("arrived");
+            prop_assert_eq!(all.records, latest(&log));
+        }
+
+        /// Whatever the server has again by itself, and whatever comes from others between two batches: in the end it
+        /// lacks nothing, and nothing is sent that it has.
+        #[test]
+        fn what_was_lost_comes_back(lost in entries(), has in entries(), meanwhile in entries(), most in 1usize..5) {
+            let (aside, mut there) = (replica(&server(&lost)), replica(&server(&has)));
+            let (mut from, mut others) = (0, meanwhile.chunks(3));
+            while let Some((records, next)) = aside.lacking(&there, from, most) {
+                prop_assert!((1..=most).contains(&records.len()) && next > from);
+                for (tag, record) in records {
+                    prop_assert_eq!(there.insert(tag, record), Inserted::Added);
+                }
+                for (tag, record) in others.next().unwrap_or_default() {
+                    there.insert(*tag, *record);
+                }
+                from = next;
+            }
+            prop_assert!(aside.lacking(&there, 0, most).is_none());
+            for (_, record) in &lost {
+                prop_assert!(there.get(record.id).is_some());
+            }
+        }
+
+        /// An empty server gets its log back so that every prefix of the old one, thus every base, is a prefix again; of
+        /// two that give back at the same time as well. Tags and contents are those that counted.
+        #[test]
+        fn a_log_comes_back_in_its_order(lost in entries(), shorter in 0usize..40, most in 1usize..5) {
+            let log = server(&lost);
+            let (aside, mut there) = (replica(&log), replica(&[]));
+            let behind = replica(&log[..shorter.min(log.len())]);
+            let mut from = [0; 2];
+            let mut lacked = true;
+            while lacked {
+                lacked = false;
+                // Both look before either's records arrive.
+                let found = [(0, &aside), (1, &behind)].map(|(i, r)| (i, r.lacking(&there, from[i], most)));
+                for (i, (records, next)) in found.into_iter().filter_map(|(i, found)| Some((i, found?))) {
+                    records.iter().for_each(|(tag, record)| _ = there.insert(*tag, *record));
+                    (from[i], lacked) = (next, true);
+                }
+            }
+            let prefixes: Vec<_> = (0..=there.position()).map(|p| digest(&there.prefix(p).expect("held").records)).collect();
+            for end in 0..=log.len() {
+                prop_assert!(prefixes.contains(&digest(&latest(&log[..end]))), "prefix of {}", end);
+            }
+            for (tag, record) in latest(&log) {
+                prop_assert_eq!(there.set.get(record.id), Some(&(tag, record)));
+            }
+        }
+
+        /// Logs followed one after another and lost one after another: nothing of any is forgotten.
+        #[test]
+        fn copies_unite(one in entries(), other in entries()) {
+            let (mut aside, later) = (replica(&server(&one)), replica(&server(&other)));
+            aside.unite(&later);
+            let both: Vec<_> = server(&one).into_iter().chain(server(&other)).collect();
+            prop_assert_eq!(aside.prefix(aside.position()).expect("held").records, latest(&server(&both)));
         }
     }
 
     #[test]
     fn what_cannot_be_right_is_refused_and_changes_nothing() {
-        let record = |id: u128| Irradiance {
-            id: RecordId(id),
-            position: Vec3::ZERO,
-            normal: Vec3::Z,
-            radius: 1.0,
-            radius_min: 0.1,
-            radius_max: 3.0,
-            irradiance: Vec3::ONE,
-            gradient_t: [Vec2::ZERO; 3],
-            gradient_r: [Vec2::ZERO; 3],
-        };
-        let batch = |id| convert::pack(&NAMESPACE, Tag::level(1), [&record(id)]);
+        let batch = |id| convert::pack(&NAMESPACE, Tag::level(1), [&record(id, Vec3::ZERO, 1.0)]);
         let mut replica = Replica::new(NAMESPACE);
         assert_eq!(replica.apply(1, &batch(5)), Err(ReplicaError::Gap { expected: 0, got: 1 }));
-        let foreign = convert::pack(&Namespace([8; 32]), Tag::level(1), [&record(5)]);
+        let foreign = v1::RecordBatch { namespace: vec![8; 32].into(), ..batch(5) };
         assert!(replica.apply(0, &foreign).expect_err("foreign").to_string().contains("another namespace"));
         assert_eq!(replica.apply(0, &batch(5)), Ok(1));
         assert_eq!(replica.apply(1, &batch(5)), Err(ReplicaError::Repeated(1)));
         assert_eq!(replica.apply(1, &batch(6)), Ok(2));
 
-        let mut caches = Caches::new(0.3, 2);
-        let mut ask = |position, digest| {
-            let part = replica.part(caches.position(), position).map_err(|e| e.to_string())?;
-            caches.seal(&part, Digest(digest)).map(|l| l[0].len()).map_err(|e| e.to_string())
-        };
-        assert_eq!(ask(3, 11), Err("position 3 has not arrived, the log ends at 2".into()));
-        let mismatch = ask(1, 4).expect_err("mismatch");
-        assert!(mismatch.starts_with("records up to position 1 have digest 0000"), "{mismatch}");
-        assert_eq!(ask(1, 5), Ok(1));
-        assert_eq!(ask(2, 11), Ok(2));
-        assert_eq!(ask(2, 11), Ok(2));
-        assert!(ask(1, 5).expect_err("zombie").starts_with("lease outdated"));
+        let reason = |part: Result<Part, ReplicaError>| part.expect_err("refused").to_string();
+        assert_eq!(reason(replica.prefix(3)), "position 3 has not arrived, the log ends at 2");
+        let sealed = Mark { epoch: 1, position: 2, step: 5 };
+        assert_eq!(reason(replica.part(sealed, 3, 5)), "position 3 has not arrived, the log ends at 2");
+        assert_eq!(reason(replica.part(sealed, 2, 4)), "lease outdated: its step is 4, sealed already for step 5");
+        assert!(replica.part(sealed, 2, 5).is_ok_and(|part| !part.anew && part.records.is_empty()));
     }
 }

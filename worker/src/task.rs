@@ -8,7 +8,8 @@ use cache_core::{Irradiance, Tag};
 use cache_proto::{convert, v1};
 
 use crate::frame::{Counts, Frame};
-use crate::job::{Job, Work, off_thread};
+use crate::job::{Job, Work};
+use crate::threads::off_thread;
 use crate::{scene, spec};
 
 /// What came of a lease.

@@ -1,5 +1,16 @@
 //! The door to durable storage. What goes through it are the wire's own entries, so that a journal needs to know nothing
 //! about records, and what comes back is checked like anything else from outside.
+//!
+//! - [`Nowhere`] keeps nothing; [`disk`] keeps appends in a redb file.
+//! - [`value`]: one append as it lies there, recognisable by itself.
+//! - [`salvage`]: finds values in the bytes of any file; [`recovery`]: opens what may be damaged, and mends it.
+//! - [`device`]: the file under redb.
+
+pub mod device;
+pub mod disk;
+pub mod recovery;
+pub mod salvage;
+pub mod value;
 
 use std::io;
 
@@ -40,3 +51,6 @@ impl Journal for Nowhere {
         false
     }
 }
+
+#[cfg(test)]
+mod tests;
