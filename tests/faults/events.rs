@@ -2,6 +2,7 @@
 
 use std::cell::RefCell;
 use std::fmt::Display;
+use std::sync::Once;
 use std::time::Duration;
 
 /// What is told of one run.
@@ -17,6 +18,7 @@ pub struct Told {
 
 #[derive(Default)]
 struct Events {
+    running: bool,
     now: Duration,
     digest: blake3::Hasher,
     keep: bool,
@@ -28,9 +30,16 @@ thread_local! {
     static EVENTS: RefCell<Events> = RefCell::default();
 }
 
-/// Begins a run.
+/// Begins a run. Panics on its thread are among what must not happen, also where a runtime swallows them.
 pub fn begin(keep: bool) {
-    EVENTS.set(Events { keep, ..Events::default() });
+    static HOOK: Once = Once::new();
+    HOOK.call_once(|| {
+        let before = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |panic| {
+            if EVENTS.with_borrow(|events| events.running) { wrong(panic) } else { before(panic) }
+        }));
+    });
+    EVENTS.set(Events { running: true, keep, ..Events::default() });
 }
 
 /// Simulated time goes on.

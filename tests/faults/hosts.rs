@@ -37,8 +37,8 @@ pub struct Farm {
     pub disk: Disk,
     /// How far the server's clock was moved on.
     pub clock: watch::Sender<Duration>,
-    /// How long the owners go away for, and the how manieth time it is.
-    pub away: watch::Sender<(u32, Duration)>,
+    /// How long the owners go away for.
+    pub away: watch::Sender<Duration>,
     /// The sharer inserts nothing more.
     pub quiet: Cell<bool>,
     /// Records the sharer was told are kept.
@@ -95,7 +95,7 @@ pub async fn server(farm: Rc<Farm>) -> turmoil::Result {
     };
     tokio::select! {
         biased;
-        served = serve_on(node.clone(), listen().await?, std::future::pending()) => Ok(served?),
+        served = serve_on(node.clone(), listen().await?, std::future::pending()) => served.map_err(|error| error.to_string().into()),
         never = node.tick() => match never {},
         () = jumps => Ok(()),
     }
@@ -120,7 +120,7 @@ pub async fn sharer(farm: Rc<Farm>) -> turmoil::Result {
     let incarnation = farm.start();
     let mut random = Random::named("sharer", &[farm.seed, incarnation]);
     let cache = client::cache(connect());
-    for number in 0.. {
+    for number in 0u64.. {
         tokio::time::sleep(Duration::from_millis(100 + (random.uniform() * 900.0) as u64)).await;
         if farm.quiet.get() {
             break;

@@ -120,7 +120,7 @@ async fn attempt(farm: &Rc<Farm>, spec: &v1::FrameSpec, base: &mut Option<Base>)
             biased;
             Ok(()) = away.changed() => {
                 drop(events);
-                let (_, time) = *away.borrow();
+                let time = *away.borrow();
                 events::note("owner", "goes away");
                 tokio::time::sleep(time).await;
                 return End::Broken;

@@ -161,7 +161,7 @@ impl World {
                 self.farm.acknowledged.borrow_mut().retain(held);
             }
             Fault::DiskFull => self.farm.disk.fill(true),
-            Fault::ClockJump(by) => self.farm.clock.send_replace(by),
+            Fault::ClockJump(by) => drop(self.farm.clock.send_replace(by)),
             Fault::Away => drop(self.farm.away.send_replace(planned.to - planned.from)),
         }
     }
