@@ -1,7 +1,7 @@
 //! `ambience`: the one command users type. Here it is only wired: each subcommand has its room.
 //!
 //! - [`args`], [`render`], [`children`], [`familiar`], [`progress`], [`stats`]: `render`.
-//! - [`compare`]: `compare`. `serve` and `worker` run the libraries `cache-server` and `worker`.
+//! - [`compare`]: `compare`. [`cache`]: `cache`. `serve` and `worker` run the libraries `cache-server` and `worker`.
 //! - [`parent`]: children end with their parent. [`failure`]: exit codes. [`say`]: stdout and stderr.
 
 use std::process::ExitCode;
@@ -11,6 +11,7 @@ use clap::error::ErrorKind;
 use clap::{Parser, Subcommand};
 
 mod args;
+mod cache;
 mod children;
 mod compare;
 mod failure;
@@ -67,6 +68,12 @@ enum Command {
     /// (mean over mean, minus 1) and the worst 8x8 block (difference of block means over the mean of the reference). The
     /// larger picture is averaged to the size of the smaller.
     Compare(compare::CompareArgs),
+    /// Look into caches, unite them, write them to files and read them back
+    ///
+    /// A cache is a directory that `render --cache` or `serve --data` wrote; OUT.ambience and OUT.jsonl are files made by
+    /// export, described in docs/format.md. Caches unite in any order, however often, to the same records.
+    #[command(subcommand)]
+    Cache(cache::CacheCommand),
 }
 
 fn main() -> ExitCode {
@@ -79,7 +86,7 @@ fn main() -> ExitCode {
         }
         Err(error) if error.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => {
             return end(Err(Failure::usage(
-                "expected a command: render, serve, worker or compare (see ambience --help)",
+                "expected a command: render, serve, worker, compare or cache (see ambience --help)",
             )));
         }
         Err(error) => return end(Err(Failure::usage(one_line(&error.render().to_string())))),
@@ -88,7 +95,7 @@ fn main() -> ExitCode {
         Command::Render(args) => block_on(render::run(args)),
         Command::Serve { serve, owned } => {
             owned.watch();
-            cache_server::cli::log_to_stderr();
+            cache_server::cli::log_to_stderr(serve.log_format);
             block_on(async { cache_server::run(serve).await.map_err(serve_failure) })
         }
         Command::Worker { worker, owned } => {
@@ -97,6 +104,7 @@ fn main() -> ExitCode {
             worker::farm::block_on(worker).map_err(|e| Failure::failed(format!("{e:#}")))
         }
         Command::Compare(args) => compare::run(&args),
+        Command::Cache(command) => cache::run(&command),
     })
 }
 

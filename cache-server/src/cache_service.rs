@@ -10,10 +10,10 @@ use cache_proto::convert::{self, Malformed};
 use cache_proto::v1;
 use cache_proto::v1::cache_server::Cache;
 use tokio_stream::Stream;
-use tokio_stream::wrappers::WatchStream;
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::access::{Tenant, tenant};
+use crate::bell::Listener;
 use crate::frames_service::Board;
 use crate::query::Queries;
 use crate::refusal::Refusal;
@@ -70,7 +70,7 @@ impl Cache for CacheService {
             let digest = convert::digest(&digest).map_err(Refusal::from)?;
             self.store.replica().resume(&namespace, position, digest)
         };
-        let subscription = Subscription::new(&self.store, tenant, namespace, position);
+        let subscription = Subscription::new(&self.store, tenant, namespace, position)?;
         // Told before the stream begins, so that the client learns it from the call itself.
         self.store.replica().belongs(&namespace, subscription.tenant.name())?;
         self.store.replica().since(&namespace, position)?;
@@ -138,7 +138,7 @@ impl Insert {
 /// its own socket and holds nobody back.
 pub struct Subscription {
     store: Counted,
-    grown: WatchStream<bool>,
+    grown: Listener,
     tenant: Tenant,
     namespace: Namespace,
     position: u64,
@@ -148,9 +148,10 @@ pub struct Subscription {
 }
 
 impl Subscription {
-    fn new(store: &Arc<Store>, tenant: Tenant, namespace: Namespace, position: u64) -> Self {
-        let grown = WatchStream::from_changes(store.grown().listen());
-        Self { store: store.count_subscriber(), grown, tenant, namespace, position, started: false, ended: false }
+    fn new(store: &Arc<Store>, tenant: Tenant, namespace: Namespace, position: u64) -> Result<Self, Refusal> {
+        let grown = store.grown().listen();
+        let store = store.count_subscriber()?;
+        Ok(Self { store, grown, tenant, namespace, position, started: false, ended: false })
     }
 
     fn read(&mut self) -> Result<Option<v1::SubscribeResponse>, Refusal> {

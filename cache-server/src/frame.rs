@@ -11,6 +11,8 @@ use cache_proto::v1::frame_event::Event;
 use cache_proto::{convert, v1};
 
 use crate::access::Tenant;
+use crate::frames::LEASE_TIME;
+use crate::metrics;
 use crate::refusal::Refusal;
 use crate::replica::Mark;
 use crate::round::{Held, Round};
@@ -122,7 +124,7 @@ impl Frame {
     }
 
     /// Leases tiles to a worker, one of `workers`. `None` when there is nothing for it now.
-    pub fn lease(&mut self, lease: u64, worker: &Arc<str>, workers: u32, deadline: Duration) -> Option<v1::Lease> {
+    pub fn lease(&mut self, lease: u64, worker: &Arc<str>, workers: u32, now: Duration) -> Option<v1::Lease> {
         if self.unfit.contains(worker) {
             return None;
         }
@@ -130,7 +132,8 @@ impl Frame {
         let fit = workers.saturating_sub(self.unfit.len() as u32).max(1);
         let round = self.round.as_mut()?;
         let share = (round.pending_tiles() / fit.saturating_mul(SHARES)).max(1);
-        let tiles = (room > 0).then(|| round.grant(lease, worker.clone(), share.min(room), deadline))??;
+        let tiles =
+            (room > 0).then(|| round.grant(lease, worker.clone(), share.min(room), now, now + LEASE_TIME))??;
         let step = Some(round.step().clone());
         Some(v1::Lease { id: lease, frame: self.id, step, tile_from: tiles.start, tile_to: tiles.end })
     }
@@ -199,6 +202,7 @@ impl Frame {
     pub fn lose(&mut self, lost: impl Fn(&Held) -> bool) -> bool {
         let count = self.round.as_mut().map_or(0, |round| round.put_back(lost));
         self.leases_lost += count;
+        metrics::leases_lost(count);
         count > 0
     }
 

@@ -10,8 +10,11 @@ use cache_proto::v1;
 
 use crate::access::Tenant;
 use crate::frame::{Frame, News, Origin};
+use crate::limits::Limits;
+use crate::metrics;
 use crate::refusal::Refusal;
 use crate::replica::Mark;
+use crate::round::Round;
 use crate::spec::Job;
 
 /// A lease that is neither completed nor renewed for this long is given to somebody else.
@@ -19,15 +22,6 @@ pub const LEASE_TIME: Duration = Duration::from_secs(6);
 
 /// A worker not heard of for this long is forgotten. Longer than it may wait for a lease without a word.
 pub const WORKER_TIME: Duration = Duration::from_secs(15);
-
-/// Most frames open at once.
-pub const FRAMES_MAX: usize = 64;
-
-/// Most workers at once.
-pub const WORKERS_MAX: usize = 4096;
-
-/// Most leases one worker holds at once, over all frames.
-pub const LEASES_MAX: usize = 64;
 
 /// Who has to be woken after a change.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
@@ -43,6 +37,7 @@ pub struct Changes {
 /// Every open frame, and every worker heard of lately.
 #[derive(Debug)]
 pub struct Frames {
+    limits: Limits,
     /// Oldest first, because numbers count up.
     frames: BTreeMap<u64, Frame>,
     /// When each worker was last heard of.
@@ -59,8 +54,8 @@ impl<F: FnOnce(&Namespace, u32) -> Mark> Marks for F {}
 impl Frames {
     /// No frames yet; numbers of frames and leases count up from `first`. A server that restarts should begin
     /// elsewhere, or a worker that lived on could complete a lease it was never given.
-    pub fn new(first: u64) -> Self {
-        Self { frames: BTreeMap::new(), workers: BTreeMap::new(), next: first, changes: Changes::default() }
+    pub fn new(limits: Limits, first: u64) -> Self {
+        Self { limits, frames: BTreeMap::new(), workers: BTreeMap::new(), next: first, changes: Changes::default() }
     }
 
     /// Opens a frame. Returns its number.
@@ -68,8 +63,9 @@ impl Frames {
     /// # Errors
     /// [`Refusal::Full`].
     pub fn open(&mut self, job: Job, origin: Origin, mark: impl Marks) -> Result<u64, Refusal> {
-        if self.frames.len() >= FRAMES_MAX {
-            return Err(Refusal::Full { what: "frames", most: FRAMES_MAX });
+        let most = self.limits.frames;
+        if self.frames.len() >= most {
+            return Err(Refusal::Full { what: "frames", most });
         }
         let (id, draft) = (self.number(), origin.draft);
         self.frames.insert(id, Frame::new(id, job, origin, |step| mark(&draft, step)));
@@ -98,13 +94,17 @@ impl Frames {
     /// [`Refusal::Full`] when there are too many workers, or this one holds too many leases.
     pub fn lease(&mut self, tenant: &Tenant, worker: &str, now: Duration) -> Result<Option<v1::Lease>, Refusal> {
         let worker = self.hear(worker, now)?;
-        if self.frames.values().map(|frame| frame.held_by(&worker)).sum::<usize>() >= LEASES_MAX {
-            return Err(Refusal::Full { what: "leases of one worker", most: LEASES_MAX });
+        if self.frames.values().map(|frame| frame.held_by(&worker)).sum::<usize>() >= self.limits.leases {
+            return Err(Refusal::Full { what: "leases of one worker", most: self.limits.leases });
         }
         let workers = self.workers.len() as u32;
-        let (number, deadline) = (self.number(), now + LEASE_TIME);
+        let number = self.number();
         let mut own = self.frames.values_mut().filter(|frame| frame.origin().tenant == *tenant);
-        Ok(own.find_map(|frame| frame.lease(number, &worker, workers, deadline)))
+        let lease = own.find_map(|frame| frame.lease(number, &worker, workers, now));
+        if lease.is_some() {
+            metrics::leased();
+        }
+        Ok(lease)
     }
 
     /// A worker says that it lives: its leases get a new deadline. Returns the leases it still holds.
@@ -126,8 +126,12 @@ impl Frames {
         let Some(frame) = self.frames.get_mut(&request.frame) else { return Ok(false) };
         let draft = frame.origin().draft;
         let step = frame.round().map(|round| round.step().index);
+        let since = frame.round().and_then(|round| round.held(request.lease, &request.worker)).map(|held| held.since);
         let accepted = frame.complete(request, |step| mark(&draft, step))?;
         self.changes.news |= accepted;
+        if let Some(since) = since.filter(|_| accepted) {
+            metrics::completed(now.saturating_sub(since));
+        }
         // A lease of pixels that brought less than the most a tile can have leaves room for others.
         let pixels = frame.round().is_some_and(|round| round.makes_pixels());
         let advanced = step != frame.round().map(|round| round.step().index);
@@ -202,6 +206,12 @@ impl Frames {
         self.workers.len()
     }
 
+    /// Leases that are held, and since when the oldest is.
+    pub fn leases(&self) -> (usize, Option<Duration>) {
+        let held = || self.frames.values().filter_map(Frame::round).flat_map(Round::leases);
+        (held().count(), held().map(|held| held.since).min())
+    }
+
     /// What changed since the last call.
     pub fn take_changes(&mut self) -> Changes {
         std::mem::take(&mut self.changes)
@@ -214,8 +224,9 @@ impl Frames {
     }
 
     fn hear(&mut self, worker: &str, now: Duration) -> Result<Arc<str>, Refusal> {
-        if self.workers.len() >= WORKERS_MAX && !self.workers.contains_key(worker) {
-            return Err(Refusal::Full { what: "workers", most: WORKERS_MAX });
+        let most = self.limits.workers;
+        if self.workers.len() >= most && !self.workers.contains_key(worker) {
+            return Err(Refusal::Full { what: "workers", most });
         }
         let name = self.workers.get_key_value(worker).map_or_else(|| Arc::from(worker), |(name, _)| name.clone());
         self.workers.insert(name.clone(), now);

@@ -12,14 +12,14 @@ use cache_proto::v1;
 use cache_proto::v1::frames_server::Frames as FramesTrait;
 use prost::Message as _;
 use tokio_stream::Stream;
-use tokio_stream::wrappers::WatchStream;
 use tonic::{Request, Response, Status};
 
 use crate::access::{Tenant, tenant};
-use crate::bell::Bell;
+use crate::bell::{Bell, Listener};
 use crate::clock::Clock;
 use crate::frame::{News, Origin};
 use crate::frames::{Changes, Frames};
+use crate::limits::Limits;
 use crate::refusal::{Refusal, same_version};
 use crate::replica::Mark;
 use crate::spec::{self, Job};
@@ -45,8 +45,14 @@ pub struct Board {
 
 impl Board {
     /// A board without frames; see [`Frames::new`] for `first`.
-    pub fn new(store: Arc<Store>, clock: Clock, first: u64) -> Self {
-        Self { frames: Mutex::new(Frames::new(first)), store, clock, work: Bell::default(), news: Bell::default() }
+    pub fn new(store: Arc<Store>, clock: Clock, limits: Limits, first: u64) -> Self {
+        Self {
+            frames: Mutex::new(Frames::new(limits, first)),
+            store,
+            clock,
+            work: Bell::default(),
+            news: Bell::default(),
+        }
     }
 
     /// Takes back leases whose deadline has come. To be called a few times a second.
@@ -64,6 +70,12 @@ impl Board {
     pub fn census(&self) -> (u64, u64) {
         let frames = lock(&self.frames);
         (frames.frames() as u64, frames.workers() as u64)
+    }
+
+    /// How many leases are held, and how old the oldest is.
+    pub fn leases(&self) -> (u64, Duration) {
+        let (held, since) = lock(&self.frames).leases();
+        (held as u64, since.map_or(Duration::ZERO, |since| self.clock.now().saturating_sub(since)))
     }
 
     /// One transition; then wakes whom it concerns.
@@ -132,7 +144,8 @@ impl Board {
                 return mark;
             }
             tokio::select! {
-                _ = grown.changed(), if !self.store.grown().is_closed() => (),
+                biased;
+                () = grown.changed(), if !self.store.grown().is_closed() => (),
                 () = &mut wait => return self.store.mark(namespace),
             }
         }
@@ -151,7 +164,8 @@ impl Board {
                 return Ok(Some(lease));
             }
             tokio::select! {
-                _ = work.changed() => (),
+                biased;
+                () = work.changed() => (),
                 () = &mut wait => return Ok(None),
             }
         }
@@ -263,7 +277,7 @@ fn named(tenant: &Tenant, worker: &str) -> Result<String, Refusal> {
 /// What the owner of a frame hears. Dropping it cancels the frame.
 pub struct Owner {
     board: Arc<Board>,
-    news: WatchStream<bool>,
+    news: Listener,
     frame: u64,
     draft: Namespace,
     ended: bool,
@@ -271,7 +285,7 @@ pub struct Owner {
 
 impl Owner {
     fn new(board: Arc<Board>, frame: u64, draft: Namespace) -> Self {
-        let news = WatchStream::from_changes(board.news.listen());
+        let news = board.news.listen();
         Self { board, news, frame, draft, ended: false }
     }
 

@@ -79,7 +79,7 @@ struct Farm {
 
 impl Farm {
     fn new(levels: u32) -> Self {
-        let mut frames = Frames::new(1);
+        let mut frames = Frames::new(Limits::default(), 1);
         let frame = opened(&mut frames, spec(TILES, levels)).expect("room");
         Self {
             frames,
@@ -257,7 +257,7 @@ fn complete(frames: &mut Frames, worker: &str, lease: &v1::Lease, bytes: usize) 
 
 #[test]
 fn leases_shrink_as_work_runs_out_and_lost_tiles_are_given_first() {
-    let mut frames = Frames::new(1);
+    let mut frames = Frames::new(Limits::default(), 1);
     open(&mut frames, 64, 0);
     let range = |lease: Option<v1::Lease>| lease.map(|l| l.tile_from..l.tile_to);
     assert_eq!(range(lease(&mut frames, "a", 0)), Some(0..16));
@@ -270,14 +270,14 @@ fn leases_shrink_as_work_runs_out_and_lost_tiles_are_given_first() {
 
 #[test]
 fn a_lease_lives_six_seconds_from_its_last_renewal() {
-    let mut frames = Frames::new(1);
+    let mut frames = Frames::new(Limits::default(), 1);
     open(&mut frames, 1, 0);
     let first = lease(&mut frames, "a", 0).expect("work");
     assert_eq!(frames.renew("a", Duration::from_secs(5)), [first.id]);
     frames.tick(Duration::from_secs(10));
     assert_eq!(lease(&mut frames, "b", 10), None);
     frames.tick(Duration::from_secs(11));
-    assert_eq!(frames.renew("a", Duration::from_secs(11)), []);
+    assert!(frames.renew("a", Duration::from_secs(11)).is_empty());
     assert!(lease(&mut frames, "b", 11).is_some());
     assert_eq!(frames.workers(), 2);
     frames.tick(Duration::from_secs(26));
@@ -286,7 +286,7 @@ fn a_lease_lives_six_seconds_from_its_last_renewal() {
 
 #[test]
 fn older_frames_come_first_and_a_worker_that_declined_gets_the_next() {
-    let mut frames = Frames::new(1);
+    let mut frames = Frames::new(Limits::default(), 1);
     let (old, new) = (open(&mut frames, 4, 0), open(&mut frames, 4, 0));
     assert_eq!(lease(&mut frames, "a", 0).expect("work").frame, old);
     frames.decline("a", old, "no such file".repeat(1000), Duration::ZERO).expect("told");
@@ -303,12 +303,12 @@ fn older_frames_come_first_and_a_worker_that_declined_gets_the_next() {
 
     frames.close(old);
     assert!(matches!(frames.frame(&Tenant::default(), old).map(Frame::job), Err(Refusal::NoFrame(_))));
-    assert_eq!(frames.renew("b", Duration::ZERO), []);
+    assert!(frames.renew("b", Duration::ZERO).is_empty());
 }
 
 #[test]
 fn pixels_wait_for_an_owner_that_does_not_read() {
-    let mut frames = Frames::new(1);
+    let mut frames = Frames::new(Limits::default(), 1);
     let big = v1::FrameSpec { width: 256 * 64, height: 256, tile_size: 256, ..spec(1, 0) };
     let frame = opened(&mut frames, big).expect("room");
     let bytes = 256 * 256 * 64;
@@ -328,7 +328,7 @@ fn pixels_wait_for_an_owner_that_does_not_read() {
 
 #[test]
 fn what_a_worker_says_wrong_is_named_and_its_lease_stays() {
-    let mut frames = Frames::new(1);
+    let mut frames = Frames::new(Limits::default(), 1);
     open(&mut frames, 8, 0);
     let work = lease(&mut frames, "a", 0).expect("work");
     let named = |result: Result<bool, Refusal>, field: &str| {
@@ -358,17 +358,17 @@ fn what_a_worker_says_wrong_is_named_and_its_lease_stays() {
 
 #[test]
 fn lists_are_bounded() {
-    let mut frames = Frames::new(1);
-    for _ in 0..FRAMES_MAX {
+    let mut frames = Frames::new(Limits::default(), 1);
+    for _ in 0..Limits::default().frames {
         open(&mut frames, 4000, 0);
     }
     assert!(matches!(opened(&mut frames, spec(1, 0)), Err(Refusal::Full { what: "frames", .. })));
-    for worker in 0..WORKERS_MAX {
+    for worker in 0..Limits::default().workers {
         lease(&mut frames, &worker.to_string(), 0);
     }
     let mut asks = |worker| frames.lease(&Tenant::default(), worker, Duration::ZERO);
     assert!(matches!(asks("one more"), Err(Refusal::Full { what: "workers", .. })));
-    for _ in 1..LEASES_MAX {
+    for _ in 1..Limits::default().leases {
         assert!(matches!(asks("0"), Ok(Some(_))));
     }
     assert!(matches!(asks("0"), Err(Refusal::Full { .. })));
@@ -376,7 +376,7 @@ fn lists_are_bounded() {
 
 #[test]
 fn a_tenants_workers_and_others_do_not_meet() {
-    let mut frames = Frames::new(1);
+    let mut frames = Frames::new(Limits::default(), 1);
     let frame = open(&mut frames, 4, 0);
     let other = Tenant::from("other");
     assert_eq!(frames.lease(&other, "other/a", Duration::ZERO).expect("room"), None);
@@ -386,7 +386,7 @@ fn a_tenants_workers_and_others_do_not_meet() {
 
 #[test]
 fn a_step_reads_what_lower_steps_gathered_and_a_filled_draft_is_told_once() {
-    let mut frames = Frames::new(1);
+    let mut frames = Frames::new(Limits::default(), 1);
     let job = Job::check(spec(1, 1)).expect("sound");
     let base = Mark { position: 7, sum: cache_core::set::Sum { records: 7, digest: cache_core::id::Digest(70) } };
     let draft = Namespace([9; 32]);

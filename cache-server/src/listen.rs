@@ -97,17 +97,18 @@ impl Bound {
     }
 }
 
-/// Binds a socket. Without `insecure`, only addresses that nobody else can reach are allowed.
+/// Binds a socket. Unless those that connect are asked who they are, or that is not wanted, it must be `open` to nobody
+/// else.
 ///
 /// Must be called within a tokio runtime.
 ///
 /// # Errors
 /// [`ServeError::Usage`] for an address that is not allowed or not there; [`ServeError::Failed`] for one that is taken.
-pub fn bind(listen: &Listen, insecure: bool) -> Result<Bound, ServeError> {
-    if !listen.is_local() && !insecure {
+pub fn bind(listen: &Listen, open: bool) -> Result<Bound, ServeError> {
+    if !listen.is_local() && !open {
         return Err(ServeError::Usage(format!(
-            "{listen} can be reached by others, who could read and change everything: \
-             use a loopback address or a Unix socket, or say --insecure"
+            "{listen} can be reached by others, who could read and change everything: give --tls-cert, --tls-key and \
+             --token-file, use a loopback address or a Unix socket, or say --insecure"
         )));
     }
     let failed = |error: io::Error| match error.kind() {

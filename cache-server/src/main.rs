@@ -16,7 +16,7 @@ struct Cli {
 #[tokio::main]
 async fn main() -> ExitCode {
     let cli = Cli::parse();
-    cache_server::cli::log_to_stderr();
+    cache_server::cli::log_to_stderr(cli.serve.log_format);
     match cache_server::run(cli.serve).await {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

@@ -34,6 +34,9 @@ pub enum Refusal {
         /// The bound.
         most: usize,
     },
+    /// There are as many connections as the server takes. Use fewer, or come again later.
+    #[error("this server takes at most {0} connections")]
+    Connections(usize),
     /// Client and server are of different builds. Install the same.
     #[error("client is version {client}, server is version {server}; they must be the same")]
     Version {
@@ -53,6 +56,9 @@ pub enum Refusal {
     /// The draft's records belong to its namespace now, and no frame fills it any more. Nothing will come: stop asking.
     #[error("the draft is published; its records are in its namespace")]
     Published,
+    /// No token, or one that is not known. Ask the one who runs the server.
+    #[error("{0}")]
+    Unknown(&'static str),
     /// The namespace belongs to another token. Use that.
     #[error("namespace {}... belongs to another token", short(.0))]
     Foreign(Namespace),
@@ -89,10 +95,11 @@ impl From<Refusal> for Status {
         match refusal {
             Refusal::Malformed(_) | Refusal::Field { .. } => Status::invalid_argument(message),
             Refusal::Batch { reason, .. } => Status::new(Status::from(*reason).code(), message),
-            Refusal::Full { .. } => Status::resource_exhausted(message),
+            Refusal::Full { .. } | Refusal::Connections(_) => Status::resource_exhausted(message),
             Refusal::Version { .. } => Status::failed_precondition(message),
             Refusal::PastEnd { .. } => Status::out_of_range(message),
             Refusal::NoFrame(_) | Refusal::Published => Status::not_found(message),
+            Refusal::Unknown(_) => Status::unauthenticated(message),
             Refusal::Foreign(_) => Status::permission_denied(message),
             Refusal::Closing | Refusal::Journal(_) => Status::unavailable(message),
             Refusal::Internal(_) => Status::internal(message),

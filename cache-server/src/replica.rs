@@ -13,25 +13,11 @@ use cache_proto::convert::{self, BATCH_RECORDS_MAX, Checked};
 use cache_proto::v1;
 use prost::Message as _;
 
+use crate::limits::Limits;
 use crate::refusal::Refusal;
 
 /// Published drafts remembered, so that what comes for them late still finds its namespace.
 const PUBLISHED_MAX: usize = 4096;
-
-/// Bounds of what one server keeps.
-#[derive(Clone, Copy, Debug)]
-pub struct Limits {
-    /// Most namespaces, drafts included.
-    pub namespaces: usize,
-    /// Most records in all logs together; one takes about 170 bytes of memory.
-    pub records: usize,
-}
-
-impl Default for Limits {
-    fn default() -> Self {
-        Self { namespaces: 1024, records: 32 << 20 }
-    }
-}
 
 /// What an insert did.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
@@ -425,7 +411,7 @@ mod tests {
 
     #[test]
     fn past_the_limits_nothing_of_a_batch_is_used() {
-        let mut replica = Replica::new(Limits { namespaces: 1, records: 3 });
+        let mut replica = Replica::new(Limits { namespaces: 1, records: 3, ..Limits::default() });
         replica.insert(NAMESPACE, Tag::level(1), &[record(1, 0.0), record(2, 0.0)]).expect("room");
         let full = replica.insert(NAMESPACE, Tag::level(1), &[record(3, 0.0), record(4, 0.0)]);
         assert!(full.expect_err("full").to_string().contains("at most 3"));
@@ -498,7 +484,7 @@ mod tests {
 
     #[test]
     fn drafts_nobody_fills_make_room() {
-        let mut replica = Replica::new(Limits { namespaces: 2, records: 8 });
+        let mut replica = Replica::new(Limits { namespaces: 2, records: 8, ..Limits::default() });
         replica.apply(label(DRAFT, Some(NAMESPACE), "")).expect("room");
         replica.apply(gathered(0, 0..5)).expect("room");
         replica.hold(DRAFT);

@@ -14,6 +14,8 @@ pub struct Held {
     pub worker: Arc<str>,
     /// Which tiles.
     pub tiles: Range<u32>,
+    /// Since when, in time since the server's start.
+    pub since: Duration,
     /// When it is lost, in time since the server's start.
     pub deadline: Duration,
 }
@@ -82,7 +84,14 @@ impl Round {
     }
 
     /// Leases up to `most` of the lowest pending tiles, contiguous. `None` when none is pending.
-    pub fn grant(&mut self, lease: u64, worker: Arc<str>, most: u32, deadline: Duration) -> Option<Range<u32>> {
+    pub fn grant(
+        &mut self,
+        lease: u64,
+        worker: Arc<str>,
+        most: u32,
+        since: Duration,
+        deadline: Duration,
+    ) -> Option<Range<u32>> {
         let (from, to) = self.pending.pop_first()?;
         let cut = from.saturating_add(most.max(1)).min(to);
         if cut < to {
@@ -90,13 +99,18 @@ impl Round {
         }
         self.pending_tiles -= cut - from;
         self.leased_tiles += cut - from;
-        self.leases.insert(lease, Held { worker, tiles: from..cut, deadline });
+        self.leases.insert(lease, Held { worker, tiles: from..cut, since, deadline });
         Some(from..cut)
     }
 
     /// The lease of a number, if `worker` holds it.
     pub fn held(&self, lease: u64, worker: &str) -> Option<&Held> {
         self.leases.get(&lease).filter(|held| &*held.worker == worker)
+    }
+
+    /// All leases.
+    pub fn leases(&self) -> impl Iterator<Item = &Held> {
+        self.leases.values()
     }
 
     /// Numbers of the leases a worker holds.

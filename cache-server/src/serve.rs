@@ -18,13 +18,21 @@ use tokio_stream::wrappers::UnixListenerStream;
 use tonic::transport::Server;
 use tonic::transport::server::{Connected, TcpIncoming};
 
+use crate::access::Tokens;
 use crate::cache_service::CacheService;
 use crate::clock::Clock;
+use crate::door::Door;
 use crate::frames_service::{Board, FramesService};
+use crate::gate::Gate;
+use crate::health::Health;
 use crate::journal::{Journal, Nowhere};
+use crate::limits::Limits;
 use crate::listen::{Bound, ServeError, Socket};
-use crate::replica::Limits;
+use crate::metrics::{self, Census};
 use crate::store::Store;
+use crate::tls::Tls;
+
+type BoxError = Box<dyn std::error::Error + Send + Sync>;
 
 /// How often lost leases are looked for.
 const TICK: Duration = Duration::from_millis(250);
@@ -41,12 +49,16 @@ const CACHE_MESSAGE_MAX: usize = 2 << 20;
 /// Largest message to the frames service, bytes: the tiles of a lease fit.
 const FRAMES_MESSAGE_MAX: usize = 8 << 20;
 
-/// HTTP/2 windows, bytes: what a client may send ahead on one stream, and on one connection.
-const STREAM_WINDOW: u32 = 4 << 20;
-const CONNECTION_WINDOW: u32 = 8 << 20;
+/// HTTP/2 windows, bytes: what a client may send ahead on one stream, and on one connection. A connection can make the
+/// server hold no more than the second.
+const STREAM_WINDOW: u32 = 1 << 20;
+const CONNECTION_WINDOW: u32 = 2 << 20;
 
-/// Most calls at once on one connection.
-const CALLS_MAX: u32 = 256;
+/// Longest list of headers of one call, bytes.
+const HEADERS_MAX: u32 = 16 << 10;
+
+/// Calls that a client may take back before the server saw them, or spoil, at a time; one that does more is cut.
+const RESETS_MAX: usize = 64;
 
 /// What a server is made of.
 pub struct Config {
@@ -56,6 +68,10 @@ pub struct Config {
     pub journal: Box<dyn Journal>,
     /// Where numbers of frames and leases begin; see [`crate::frames::Frames::new`].
     pub first_number: u64,
+    /// Who may call.
+    pub tokens: Tokens,
+    /// How TCP connections are encrypted, if they are.
+    pub tls: Option<Tls>,
 }
 
 impl Default for Config {
@@ -63,7 +79,13 @@ impl Default for Config {
     fn default() -> Self {
         // Below 2^52, so that scripts may hold them in a double.
         let random = RandomState::new().build_hasher().finish() >> 32;
-        Self { limits: Limits::default(), journal: Box::new(Nowhere), first_number: (random << 20) + 1 }
+        Self {
+            limits: Limits::default(),
+            journal: Box::new(Nowhere),
+            first_number: (random << 20) + 1,
+            tokens: Tokens::default(),
+            tls: None,
+        }
     }
 }
 
@@ -72,6 +94,11 @@ impl Default for Config {
 pub struct Node {
     store: Arc<Store>,
     board: Arc<Board>,
+    door: Arc<Door>,
+    gate: Gate,
+    health: Arc<Health>,
+    tls: Option<Tls>,
+    calls: u32,
 }
 
 impl Node {
@@ -80,20 +107,36 @@ impl Node {
     /// # Errors
     /// When the journal cannot be read.
     pub fn new(config: Config) -> io::Result<Self> {
-        let (store, writer) = Store::open(config.limits, config.journal)?;
+        let Config { limits, journal, first_number, tokens, tls } = config;
+        let (store, writer) = Store::open(limits, journal)?;
         tokio::spawn(writer.run());
         let store = Arc::new(store);
-        let board = Arc::new(Board::new(store.clone(), Clock::start(), config.first_number));
-        Ok(Self { store, board })
+        let board = Arc::new(Board::new(store.clone(), Clock::start(), limits, first_number));
+        let (door, gate) = (Arc::new(Door::new(limits.connections)), Gate::new(tokens, limits.inflow));
+        // The range of the limit is far smaller than a u32.
+        let calls = u32::try_from(limits.calls).unwrap_or(u32::MAX);
+        Ok(Self { store, board, door, gate, health: Arc::default(), tls, calls })
     }
 
-    /// Takes back lost leases, for ever.
+    /// Takes back lost leases, and tells how things stand, for ever.
     pub async fn tick(&self) -> Infallible {
         let mut ticks = tokio::time::interval(TICK);
         loop {
             ticks.tick().await;
             self.board.tick();
+            let ready = self.store.works();
+            self.health.tell(ready).await;
+            self.show(ready);
         }
+    }
+
+    fn show(&self, ready: bool) {
+        let (records, namespaces) = self.store.replica().census();
+        let ((frames, workers), (leases, oldest_lease)) = (self.board.census(), self.board.leases());
+        let (connections, subscribers) = (self.door.open() as u64, self.store.subscribers());
+        let census =
+            Census { records, namespaces, connections, subscribers, frames, workers, leases, oldest_lease, ready };
+        metrics::show(census);
     }
 
     /// Sends away all who wait: subscribers, owners of frames, workers without a lease.
@@ -108,35 +151,50 @@ impl Node {
 ///
 /// # Errors
 /// When the services cannot be built or the transport fails.
-pub async fn serve_on<I, IO>(
+pub async fn serve_on<I, IO>(node: Node, incoming: I, shutdown: impl Future<Output = ()>) -> Result<(), BoxError>
+where
+    I: Stream<Item = io::Result<IO>>,
+    IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+{
+    serve_encrypted(node, None, incoming, shutdown).await
+}
+
+async fn serve_encrypted<I, IO>(
     node: Node,
+    tls: Option<Tls>,
     incoming: I,
     shutdown: impl Future<Output = ()>,
-) -> Result<(), Box<dyn std::error::Error + Send + Sync>>
+) -> Result<(), BoxError>
 where
     I: Stream<Item = io::Result<IO>>,
     IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
 {
     let cache = CacheServer::new(CacheService::new(node.store.clone(), node.board.clone()));
     let frames = FramesServer::new(FramesService::new(node.board));
-    let (reporter, health) = tonic_health::server::health_reporter();
-    reporter.set_serving::<CacheServer<CacheService>>().await;
-    reporter.set_serving::<FramesServer<FramesService>>().await;
+    node.health.tell(node.store.works()).await;
     let reflection = tonic_reflection::server::Builder::configure()
         .register_encoded_file_descriptor_set(cache_proto::DESCRIPTORS)
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
         .build_v1()?;
-    Server::builder()
+    let mut server = Server::builder();
+    if let Some(tls) = &tls {
+        server = server.tls_config(tls.config().clone())?;
+    }
+    server
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE))
         .initial_stream_window_size(STREAM_WINDOW)
         .initial_connection_window_size(CONNECTION_WINDOW)
-        .max_concurrent_streams(CALLS_MAX)
+        .max_concurrent_streams(node.calls)
+        .http2_max_header_list_size(HEADERS_MAX)
+        .http2_max_pending_accept_reset_streams(Some(RESETS_MAX))
+        .http2_max_local_error_reset_streams(Some(RESETS_MAX))
+        .layer(node.gate)
         .add_service(cache.max_decoding_message_size(CACHE_MESSAGE_MAX))
         .add_service(frames.max_decoding_message_size(FRAMES_MESSAGE_MAX))
-        .add_service(health)
+        .add_service(node.health.service())
         .add_service(reflection)
-        .serve_with_incoming_shutdown(incoming, shutdown)
+        .serve_with_incoming_shutdown(node.door.guests(incoming), shutdown)
         .await?;
     Ok(())
 }
@@ -166,6 +224,7 @@ pub async fn serve(sockets: Vec<Bound>, config: Config, shutdown: impl Future<Ou
         never = node.tick() => match never {},
         () = shutdown => (),
     }
+    node.health.close().await;
     node.close();
     stop.send_replace(true);
     if let Ok(result) = tokio::time::timeout(DRAIN, ended).await {
@@ -176,17 +235,16 @@ pub async fn serve(sockets: Vec<Bound>, config: Config, shutdown: impl Future<Ou
     Ok(())
 }
 
-async fn serve_socket(
-    node: Node,
-    socket: Socket,
-    mut stopped: watch::Receiver<bool>,
-) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+async fn serve_socket(node: Node, socket: Socket, mut stopped: watch::Receiver<bool>) -> Result<(), BoxError> {
     let shutdown = async move {
         // An error means that `serve` itself was dropped.
         let _ = stopped.wait_for(|stopped| *stopped).await;
     };
     match socket {
-        Socket::Tcp(listener) => serve_on(node, TcpIncoming::from(listener).with_nodelay(Some(true)), shutdown).await,
+        Socket::Tcp(listener) => {
+            let tls = node.tls.clone();
+            serve_encrypted(node, tls, TcpIncoming::from(listener).with_nodelay(Some(true)), shutdown).await
+        }
         Socket::Unix(listener, _file) => serve_on(node, UnixListenerStream::new(listener), shutdown).await,
     }
 }

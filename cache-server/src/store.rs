@@ -5,7 +5,7 @@
 //! replica's lock is held for the time of one entry at most and never across an await.
 
 use std::io;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
 
 use cache_core::{Irradiance, Namespace};
@@ -15,9 +15,12 @@ use cache_proto::v1::{Entry, Label, Publication, RecordBatch};
 use tokio::sync::{mpsc, oneshot};
 
 use crate::bell::Bell;
+use crate::clock::Clock;
 use crate::journal::Journal;
+use crate::limits::Limits;
+use crate::metrics;
 use crate::refusal::Refusal;
-use crate::replica::{Added, Limits, Mark, Replica};
+use crate::replica::{Added, Mark, Replica};
 
 /// Most entries that wait to be written; whoever brings more waits. An entry has at most half a megabyte.
 const QUEUE_MAX: usize = 64;
@@ -30,12 +33,15 @@ pub struct Store {
     shared: Arc<Shared>,
     queue: mpsc::Sender<Pending>,
     subscribers: AtomicU64,
+    subscribers_max: usize,
 }
 
 #[derive(Debug)]
 struct Shared {
     replica: RwLock<Replica>,
     grown: Bell,
+    /// The journal did not take the last group.
+    failing: AtomicBool,
 }
 
 /// An entry on its way, and whom to tell.
@@ -69,10 +75,11 @@ impl Store {
             let checked = convert::entry(&entry).map_err(io::Error::other)?;
             replica.apply(checked).map(drop).map_err(io::Error::other)
         })?;
-        let shared = Arc::new(Shared { replica: RwLock::new(replica), grown: Bell::default() });
+        let shared =
+            Arc::new(Shared { replica: RwLock::new(replica), grown: Bell::default(), failing: AtomicBool::new(false) });
         let (queue, waiting) = mpsc::channel(QUEUE_MAX);
         let writer = Writer { journal: Some(journal), waiting, shared: shared.clone() };
-        Ok((Self { shared, queue, subscribers: AtomicU64::new(0) }, writer))
+        Ok((Self { shared, queue, subscribers: AtomicU64::new(0), subscribers_max: limits.subscribers }, writer))
     }
 
     /// Checks a batch a tenant sent and queues it; waits while the queue is full. The first batch of a namespace makes it
@@ -158,15 +165,24 @@ impl Store {
         &self.shared.grown
     }
 
+    /// Whether the journal takes what is brought, as far as is known.
+    pub fn works(&self) -> bool {
+        !self.shared.failing.load(Ordering::Relaxed)
+    }
+
     /// How many subscriptions are open.
     pub fn subscribers(&self) -> u64 {
         self.subscribers.load(Ordering::Relaxed)
     }
 
     /// Counts one subscription for as long as the result lives.
-    pub fn count_subscriber(self: &Arc<Self>) -> Counted {
-        self.subscribers.fetch_add(1, Ordering::Relaxed);
-        Counted(self.clone())
+    ///
+    /// # Errors
+    /// [`Refusal::Full`].
+    pub fn count_subscriber(self: &Arc<Self>) -> Result<Counted, Refusal> {
+        let before = self.subscribers.fetch_add(1, Ordering::Relaxed);
+        let (counted, most) = (Counted(self.clone()), self.subscribers_max);
+        if before >= most as u64 { Err(Refusal::Full { what: "subscribers", most }) } else { Ok(counted) }
     }
 }
 
@@ -196,8 +212,12 @@ impl Writer {
     /// Makes a group durable, then shows it.
     async fn write(&mut self, group: Vec<Pending>) {
         let group = self.admitted(group);
+        if group.is_empty() {
+            return;
+        }
         let entries: Vec<Entry> = group.iter().map(|pending| pending.entry.clone()).collect();
         let appended = self.append(entries).await;
+        self.shared.failing.store(appended.is_err(), Ordering::Relaxed);
         for pending in group {
             let kept = match &appended {
                 Ok(()) => self.shared.write(|replica| replica.apply(pending.checked)),
@@ -229,10 +249,23 @@ impl Writer {
     }
 
     async fn append(&mut self, entries: Vec<Entry>) -> io::Result<()> {
+        let (count, clock) = (entries.len(), Clock::start());
+        let appended = self.append_now(entries).await;
+        match &appended {
+            Ok(()) => metrics::appended(count, clock.now()),
+            Err(error) => {
+                tracing::error!(%error, "the journal failed");
+                metrics::append_failed();
+            }
+        }
+        appended
+    }
+
+    async fn append_now(&mut self, entries: Vec<Entry>) -> io::Result<()> {
         let lost = || io::Error::other("it is gone; see the log");
         let mut journal = self.journal.take().ok_or_else(lost)?;
-        if entries.is_empty() || !journal.waits() {
-            let appended = if entries.is_empty() { Ok(()) } else { journal.append(&entries) };
+        if !journal.waits() {
+            let appended = journal.append(&entries);
             self.journal = Some(journal);
             return appended;
         }

@@ -9,7 +9,6 @@ use std::time::Duration;
 use cache_core::id::Random;
 use cache_core::{Namespace, RecordId, Tag};
 use cache_proto::v1;
-use cache_server::replica::Limits;
 use cache_server::{Config, Node, serve_on};
 use glam::Vec3;
 use tokio::sync::watch;
@@ -84,7 +83,7 @@ impl Farm {
 pub async fn server(farm: Rc<Farm>) -> turmoil::Result {
     let first_number = farm.start() << 20;
     events::note(network::SERVER, "starts");
-    let config = Config { limits: Limits::default(), journal: Box::new(farm.disk.clone()), first_number };
+    let config = Config { journal: Box::new(farm.disk.clone()), first_number, ..Config::default() };
     let node = Node::new(config)?;
     let mut clock = farm.clock.subscribe();
     let jumps = async {

@@ -19,7 +19,7 @@ use super::value::{self, FORMAT, MAGIC, Place};
 pub const FILE: &str = "journal.redb";
 
 /// Name of the file whose lock says that a process uses the directory.
-const LOCK: &str = "journal.lock";
+pub(super) const LOCK: &str = "journal.lock";
 
 /// Memory redb may keep pages in, bytes. A journal is read once.
 const CACHE_BYTES: usize = 32 << 20;
@@ -128,6 +128,13 @@ pub(super) fn open(
     Ok(builder.create_with_backend(Device::new(file, sync))?)
 }
 
+/// Opens a file that must not be written to.
+pub(super) fn open_read_only(path: &Path) -> Result<redb::ReadOnlyDatabase, redb::Error> {
+    let mut builder = Database::builder();
+    builder.set_cache_size(CACHE_BYTES);
+    Ok(builder.open_read_only_with_backend(Device::new(File::open(path)?, Sync::PageCache))?)
+}
+
 /// Makes a new file a journal.
 pub(super) fn begin(database: &Database) -> Result<(), redb::Error> {
     let transaction = database.begin_write()?;
@@ -152,7 +159,10 @@ pub(super) fn write<'a>(
 }
 
 /// Reads and checks all values, until `each` says false; returns the place behind the last.
-pub(super) fn read(database: &Database, mut each: impl FnMut(&value::Header, &[u8]) -> bool) -> Result<Place, Wrong> {
+pub(super) fn read(
+    database: &impl redb::ReadableDatabase,
+    mut each: impl FnMut(&value::Header, &[u8]) -> bool,
+) -> Result<Place, Wrong> {
     let damaged = |error: redb::Error| Wrong::Damaged(error.to_string());
     let transaction = database.begin_read().map_err(|e| damaged(e.into()))?;
     let formats = transaction.open_table(FORMATS).map_err(|e| damaged(e.into()))?;
@@ -190,6 +200,25 @@ fn last(database: &Database) -> Result<Place, redb::Error> {
         Ok::<_, value::Unsound>(Place { sequence: header.sequence, before: header.before }.after(&header))
     });
     last.transpose().map(Option::unwrap_or_default).map_err(|e| redb::Error::Corrupted(e.to_string()))
+}
+
+/// Whether a journal can be opened in a directory, or the directory made. What is in it is not looked at: opening it may
+/// mean to mend it.
+///
+/// # Errors
+/// [`OpenError`].
+pub fn usable(directory: &Path) -> Result<(), OpenError> {
+    if directory.exists() {
+        return lock(directory).map(drop);
+    }
+    let parent = directory.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let error = match std::fs::metadata(parent) {
+        Ok(there) if there.permissions().readonly() => io::ErrorKind::PermissionDenied.into(),
+        Ok(there) if !there.is_dir() => io::ErrorKind::NotADirectory.into(),
+        Ok(_) => return Ok(()),
+        Err(error) => error,
+    };
+    Err(OpenError::Directory { directory: directory.into(), error })
 }
 
 /// Takes the directory for this process, making it if it is not there.

@@ -4,12 +4,14 @@
 //! - [`Nowhere`] keeps nothing; [`disk`] keeps appends in a redb file.
 //! - [`value`]: one append as it lies there, recognisable by itself.
 //! - [`salvage`]: finds values in the bytes of any file; [`recovery`]: opens what may be damaged, and mends it.
+//! - [`survey`]: reads a journal without writing to it.
 //! - [`device`]: the file under redb.
 
 pub mod device;
 pub mod disk;
 pub mod recovery;
 pub mod salvage;
+pub mod survey;
 pub mod value;
 
 use std::io;

@@ -36,6 +36,9 @@ pub enum OpenError {
         /// Its format.
         found: u32,
     },
+    /// The directory has no journal.
+    #[error("{} holds no cache: there is no {}", .0.display(), disk::FILE)]
+    Absent(PathBuf),
     /// The directory cannot be used.
     #[error("cannot use {}: {error}", directory.display())]
     Directory {
@@ -58,7 +61,7 @@ impl OpenError {
     /// The exit code of a command that ends with this.
     pub fn exit_code(&self) -> u8 {
         match self {
-            Self::Foreign(_) | Self::Newer { .. } | Self::Directory { .. } => 2,
+            Self::Foreign(_) | Self::Absent(_) | Self::Newer { .. } | Self::Directory { .. } => 2,
             Self::InUse(_) | Self::File { .. } => 1,
         }
     }
@@ -269,7 +272,7 @@ fn remove(path: &Path) -> io::Result<()> {
 }
 
 /// Runs what may panic on bytes that redb did not write: it promises errors there, and this makes sure.
-fn contained<T>(work: impl FnOnce() -> T) -> Result<T, String> {
+pub(super) fn contained<T>(work: impl FnOnce() -> T) -> Result<T, String> {
     catch_unwind(AssertUnwindSafe(work)).map_err(|panic| {
         let text = panic.downcast_ref::<String>().map(String::as_str).or(panic.downcast_ref::<&str>().copied());
         format!("redb failed on it: {}", text.unwrap_or("unknown"))
