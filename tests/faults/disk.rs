@@ -6,8 +6,9 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use cache_core::id::{Digest, Random};
 use cache_core::{Irradiance, Namespace, Tag};
 use cache_proto::v1::Entry;
+use cache_server::Limits;
 use cache_server::journal::Journal;
-use cache_server::replica::{Limits, Replica};
+use cache_server::replica::Replica;
 
 use crate::events;
 

@@ -111,12 +111,12 @@ impl Schedule {
     pub fn of(seed: u64) -> Self {
         let mut random = Random::named("schedule", &[seed]);
         let mut below = |n: usize| ((random.uniform() * n as f32) as usize).min(n - 1);
-        let latency = [2, 10, 30, 100][below(4)];
+        let latency = [1, 5, 20, 50][below(4)];
         let owners = [1, 1, 2][below(3)];
         let workers = 1 + below(3);
         let threads = 1 + below(2);
-        let levels = [1, 1, 1, 2][below(4)];
-        let tiles = 2 + below(7) as u32;
+        let levels = if below(8) == 0 { 2 } else { 1 };
+        let tiles = 1 + below(4) as u32;
         let count = below(7);
         let mut faults: Vec<Planned> = Vec::new();
         for _ in 0..count {
