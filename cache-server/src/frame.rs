@@ -147,10 +147,10 @@ impl Frame {
         if free == 0 { 0 } else { (free.min(COMPLETE_BYTES_MAX) / tile).max(1) as u32 }
     }
 
-    /// Moves the deadline of a worker's leases; returns their numbers.
-    pub fn renew(&mut self, worker: &str, deadline: Duration) -> Vec<u64> {
+    /// Moves the deadline of leases a worker names; returns the numbers of those it holds.
+    pub fn renew(&mut self, worker: &str, leases: &BTreeSet<u64>, deadline: Duration) -> Vec<u64> {
         let Some(round) = &mut self.round else { return Vec::new() };
-        round.renew(worker, deadline);
+        round.renew(worker, leases, deadline);
         round.held_by(worker).collect()
     }
 

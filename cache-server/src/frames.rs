@@ -1,7 +1,7 @@
 //! All frames and workers: who gets which lease, and when it is lost. No I/O; time and the state of the record sets are
 //! passed in, so that a test or a simulator decides both.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -30,7 +30,7 @@ pub struct Changes {
     pub work: bool,
     /// There may be something to tell: owners of frames.
     pub news: bool,
-    /// A draft is whole and may be published, and where to.
+    /// The draft of a frame that makes records is whole and may be published, and where to.
     pub filled: Option<(Namespace, Namespace)>,
 }
 
@@ -107,12 +107,12 @@ impl Frames {
         Ok(lease)
     }
 
-    /// A worker says that it lives: its leases get a new deadline. Returns the leases it still holds.
-    pub fn renew(&mut self, worker: &str, now: Duration) -> Vec<u64> {
+    /// A worker says that it lives: the leases it names get a new deadline. Returns the leases it still holds.
+    pub fn renew(&mut self, worker: &str, leases: &BTreeSet<u64>, now: Duration) -> Vec<u64> {
         if let Some(heard) = self.workers.get_mut(worker) {
             *heard = now;
         }
-        self.frames.values_mut().flat_map(|frame| frame.renew(worker, now + LEASE_TIME)).collect()
+        self.frames.values_mut().flat_map(|frame| frame.renew(worker, leases, now + LEASE_TIME)).collect()
     }
 
     /// Ends a lease. False when it was lost before, or completed: nothing of the request is used then.
@@ -136,7 +136,7 @@ impl Frames {
         let pixels = frame.round().is_some_and(|round| round.makes_pixels());
         let advanced = step != frame.round().map(|round| round.step().index);
         self.changes.work |= accepted && (pixels || advanced);
-        if accepted && pixels && advanced {
+        if accepted && pixels && advanced && frame.job().spec.levels > 0 {
             self.changes.filled = Some((draft, frame.job().namespace));
         }
         Ok(accepted)

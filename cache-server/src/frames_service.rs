@@ -109,6 +109,12 @@ impl Board {
         let job = Job::check(spec.ok_or(Refusal::Malformed(Malformed::Missing("spec")))?)?;
         let namespace = job.namespace;
         self.store.replica().belongs(&namespace, tenant.name())?;
+        if self.store.replica().is_draft(&namespace) {
+            return Err(Refusal::field(
+                "namespace",
+                "is the draft of a frame, expected that of a scene and its settings",
+            ));
+        }
         let base = if base.is_empty() {
             self.store.mark(&namespace)
         } else {
@@ -120,9 +126,9 @@ impl Board {
         if job.spec.levels > 0 {
             self.store.label(label(&job, tenant.name(), namespace, None)).await?;
             self.store.label(label(&job, tenant.name(), draft, Some(namespace))).await?;
+            self.store.hold(draft);
         }
         let origin = Origin { tenant: tenant.clone(), base, draft };
-        self.store.hold(draft);
         let opened = self.change(|frames, _| frames.open(job, origin, |draft, step| self.mark(draft, step)));
         if opened.is_err() {
             self.store.release(&draft);
@@ -215,7 +221,8 @@ impl FramesTrait for FramesService {
 
     async fn renew(&self, request: Request<v1::RenewRequest>) -> Result<Response<v1::RenewResponse>, Status> {
         let worker = named(&tenant(&request), &request.get_ref().worker)?;
-        let leases = self.0.change(|frames, now| frames.renew(&worker, now));
+        let leases = request.into_inner().leases.into_iter().collect();
+        let leases = self.0.change(|frames, now| frames.renew(&worker, &leases, now));
         Ok(Response::new(v1::RenewResponse { leases }))
     }
 

@@ -109,7 +109,8 @@ impl Farm {
                 assert!(!self.complete(&worker, &lease), "a lost lease is not accepted");
             }
             Act::Renew(w) => {
-                let mut kept = self.frames.renew(&name(w), self.now);
+                let mine = self.held.iter().filter(|h| h.0 == name(w)).map(|h| h.1.id).collect();
+                let mut kept = self.frames.renew(&name(w), &mine, self.now);
                 kept.sort_unstable();
                 let mut held: Vec<_> = self.held.iter().filter(|h| h.0 == name(w)).map(|h| h.1.id).collect();
                 held.sort_unstable();
@@ -273,11 +274,11 @@ fn a_lease_lives_six_seconds_from_its_last_renewal() {
     let mut frames = Frames::new(Limits::default(), 1);
     open(&mut frames, 1, 0);
     let first = lease(&mut frames, "a", 0).expect("work");
-    assert_eq!(frames.renew("a", Duration::from_secs(5)), [first.id]);
+    assert_eq!(frames.renew("a", &BTreeSet::from([first.id]), Duration::from_secs(5)), [first.id]);
     frames.tick(Duration::from_secs(10));
     assert_eq!(lease(&mut frames, "b", 10), None);
     frames.tick(Duration::from_secs(11));
-    assert!(frames.renew("a", Duration::from_secs(11)).is_empty());
+    assert!(frames.renew("a", &BTreeSet::from([first.id]), Duration::from_secs(11)).is_empty());
     assert!(lease(&mut frames, "b", 11).is_some());
     assert_eq!(frames.workers(), 2);
     frames.tick(Duration::from_secs(26));
@@ -303,7 +304,7 @@ fn older_frames_come_first_and_a_worker_that_declined_gets_the_next() {
 
     frames.close(old);
     assert!(matches!(frames.frame(&Tenant::default(), old).map(Frame::job), Err(Refusal::NoFrame(_))));
-    assert!(frames.renew("b", Duration::ZERO).is_empty());
+    assert!(frames.renew("b", &BTreeSet::new(), Duration::ZERO).is_empty());
 }
 
 #[test]
@@ -423,4 +424,15 @@ fn a_step_reads_what_lower_steps_gathered_and_a_filled_draft_is_told_once() {
     let Some(Event::Done(done)) = told.last() else { panic!("{told:?}") };
     assert_eq!(done.records, 7 + u64::from(steps));
     assert_eq!(convert::digest(&done.digest).expect("16 bytes").0, 70 + u128::from(steps));
+}
+
+#[test]
+fn a_lease_its_worker_never_heard_of_runs_out() {
+    let mut frames = Frames::new(Limits::default(), 1);
+    open(&mut frames, 8, 0);
+    let heard = lease(&mut frames, "a", 0).expect("work");
+    let unheard = lease(&mut frames, "a", 0).expect("work");
+    frames.renew("a", &BTreeSet::from([heard.id]), Duration::from_secs(5));
+    frames.tick(Duration::from_secs(7));
+    assert_eq!(frames.renew("a", &BTreeSet::from([heard.id, unheard.id]), Duration::from_secs(7)), [heard.id]);
 }

@@ -3,6 +3,7 @@
 //! It is what a list of entries amounts to, in whatever order and however often they come: every server, journal and
 //! archive is read through [`Replica::apply`].
 
+use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::Range;
 
@@ -94,17 +95,19 @@ impl Replica {
     /// [`Refusal::Full`].
     pub fn admit(&mut self, namespace: &Namespace, count: usize) -> Result<(), Refusal> {
         if self.room(namespace, count).is_err() {
-            let idle = |n: &Namespace, kept: &Kept| kept.draft_of.is_some() && kept.holds == 0 && n != namespace;
-            let held = &mut self.held;
-            self.kept.retain(|n, kept| {
-                let idle = idle(n, kept);
-                if idle {
-                    *held -= kept.set.position();
-                }
-                !idle
-            });
+            let idle = |(n, kept): &(&Namespace, &Kept)| kept.draft_of.is_some() && kept.holds == 0 && *n != namespace;
+            let idle: Vec<_> = self.kept.iter().filter(idle).map(|(n, _)| *n).collect();
+            idle.iter().for_each(|draft| self.forget(draft));
         }
         self.room(namespace, count)
+    }
+
+    /// Gives up a namespace. Drafts published to it are drafts no more: their records are gone.
+    fn forget(&mut self, namespace: &Namespace) {
+        let Some(kept) = self.kept.remove(namespace) else { return };
+        self.held -= kept.set.position();
+        self.published.retain(|_, published| published.namespace != *namespace);
+        self.publications.retain(|draft| self.published.contains_key(draft));
     }
 
     fn room(&self, namespace: &Namespace, count: usize) -> Result<(), Refusal> {
@@ -171,7 +174,9 @@ impl Replica {
         }
         let (end, added) = (set.position(), (set.len() - known) as u64);
         self.held += end - start;
-        if self.published.insert(draft, Published { namespace, range: start..end }).is_none() {
+        // Said again, it brings nothing new: the first time tells which part of the log the draft is.
+        if let Entry::Vacant(first) = self.published.entry(draft) {
+            first.insert(Published { namespace, range: start..end });
             self.publications.push_back(draft);
             if self.publications.len() > PUBLISHED_MAX {
                 self.publications.pop_front().map(|oldest| self.published.remove(&oldest));
@@ -181,22 +186,24 @@ impl Replica {
         Ok(Added { added, position: end as u64 })
     }
 
-    /// A frame begins to fill a draft. One that was published comes back as it was.
+    /// A frame begins to fill a draft. One that was published comes back as it was, if there is room.
     pub fn hold(&mut self, draft: Namespace) {
         let known = self.kept.contains_key(&draft);
         let again = self.published.get(&draft).filter(|_| !known).and_then(|published| {
-            let log = self.kept.get(&published.namespace)?.set.since(published.range.start);
-            Some(log[..published.range.len()].to_vec())
+            let log = self.kept.get(&published.namespace)?.set.since(0);
+            log.get(published.range.clone()).map(<[_]>::to_vec)
         });
+        let again = again.filter(|log| self.admit(&draft, log.len()).is_ok());
         let kept = self.kept.entry(draft).or_default();
         kept.holds += 1;
+        let before = kept.set.position();
         for (tag, record) in again.unwrap_or_default() {
             kept.set.insert(tag, record);
-            self.held += 1;
         }
+        self.held += kept.set.position() - before;
     }
 
-    /// A frame has ended: a draft no other frame fills is forgotten if it was published.
+    /// A frame has ended: a draft no other frame fills is forgotten if it was published, or nothing is known of it.
     pub fn release(&mut self, draft: &Namespace) {
         if let Some(kept) = self.kept.get_mut(draft) {
             kept.holds = kept.holds.saturating_sub(1);
@@ -205,9 +212,9 @@ impl Replica {
     }
 
     fn retire(&mut self, draft: &Namespace) {
-        let idle = self.kept.get(draft).is_some_and(|kept| kept.holds == 0);
-        if idle && self.published.contains_key(draft) {
-            self.held -= self.kept.remove(draft).map_or(0, |kept| kept.set.position());
+        let Some(kept) = self.kept.get(draft).filter(|kept| kept.holds == 0) else { return };
+        if self.published.contains_key(draft) || (kept.set.is_empty() && kept.label.is_none()) {
+            self.forget(draft);
         }
     }
 
@@ -286,6 +293,11 @@ impl Replica {
     /// Whether anything is known of a namespace.
     pub fn is_known(&self, namespace: &Namespace) -> bool {
         self.kept.contains_key(namespace) || self.published.contains_key(namespace)
+    }
+
+    /// Whether a namespace is the draft of a frame, published or not.
+    pub fn is_draft(&self, namespace: &Namespace) -> bool {
+        self.kept.get(namespace).is_some_and(|kept| kept.draft_of.is_some()) || self.published.contains_key(namespace)
     }
 
     /// What a namespace is.
@@ -519,5 +531,51 @@ mod tests {
         replica.insert(DRAFT, Tag::level(1), &[record(1, 0.0)]).expect("room");
         assert!(replica.belongs(&DRAFT, "").is_ok() && replica.belongs(&DRAFT, "a").is_err());
         assert_eq!((replica.info("a").len(), replica.info("b").len(), replica.info("").len()), (1, 0, 1));
+    }
+
+    /// A draft of three records, published.
+    fn published(limits: Limits) -> (Replica, Namespace) {
+        let (mut replica, draft) = (Replica::new(limits), Namespace([1; 32]));
+        replica.insert(draft, Tag::level(1), &[1, 2, 3].map(|id| record(id, 0.0))).expect("room");
+        replica.publish(draft, NAMESPACE).expect("room");
+        (replica, draft)
+    }
+
+    #[test]
+    fn a_publication_said_again_changes_nothing() {
+        let (mut replica, draft) = published(Limits::default());
+        replica.publish(draft, NAMESPACE).expect("room");
+        replica.hold(draft);
+        assert_eq!(replica.mark(&draft).sum, replica.mark(&NAMESPACE).sum);
+    }
+
+    #[test]
+    fn a_draft_comes_back_only_if_there_is_room() {
+        let (mut replica, draft) = published(Limits { namespaces: 4, records: 6, ..Limits::default() });
+        replica.insert(NAMESPACE, Tag::level(1), &[record(4, 0.0)]).expect("room");
+        replica.hold(draft);
+        assert_eq!((replica.mark(&draft).position, replica.census()), (0, (4, 2)));
+    }
+
+    #[test]
+    fn a_draft_published_to_what_was_given_up_begins_anew() {
+        let (mut replica, draft) = published(Limits { namespaces: 4, records: 8, ..Limits::default() });
+        let label = v1::Label { namespace: NAMESPACE.0.to_vec().into(), ..Default::default() };
+        replica.label(NAMESPACE, Some(draft), label).expect("room");
+        let others = [11, 12, 13, 14, 15, 16].map(|id| record(id, 0.0));
+        replica.insert(Namespace([2; 32]), Tag::level(1), &others).expect("room for the idle draft's");
+        replica.insert(NAMESPACE, Tag::level(1), &[record(4, 0.0)]).expect("room");
+        replica.hold(draft);
+        assert_eq!((replica.mark(&draft).position, replica.census()), (0, (7, 3)));
+    }
+
+    #[test]
+    fn drafts_nothing_came_of_are_forgotten() {
+        let mut replica = Replica::new(Limits::default());
+        for view in 0..9 {
+            replica.hold(Namespace([view; 32]));
+            replica.release(&Namespace([view; 32]));
+        }
+        assert_eq!(replica.census(), (0, 0));
     }
 }

@@ -1,6 +1,6 @@
 //! The tiles of one step: each is pending, leased to one worker, or done. No I/O; time is passed in.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::sync::Arc;
 use std::time::Duration;
@@ -118,9 +118,10 @@ impl Round {
         self.leases.iter().filter(move |(_, held)| &*held.worker == worker).map(|(&lease, _)| lease)
     }
 
-    /// Moves the deadline of all leases a worker holds.
-    pub fn renew(&mut self, worker: &str, deadline: Duration) {
-        for held in self.leases.values_mut().filter(|held| &*held.worker == worker) {
+    /// Moves the deadline of those of the leases that a worker holds.
+    pub fn renew(&mut self, worker: &str, leases: &BTreeSet<u64>, deadline: Duration) {
+        let named = self.leases.iter_mut().filter(|(id, held)| leases.contains(id) && &*held.worker == worker);
+        for (_, held) in named {
             held.deadline = deadline;
         }
     }

@@ -393,7 +393,8 @@ async fn an_owner_that_goes_away_cancels_its_frame() {
     let lease = waiting.expect("served").into_inner().lease.expect("work");
     let described = soon(frames.describe(v1::DescribeRequest { frame: lease.frame })).await.expect("open");
     assert_eq!(described.into_inner().spec, Some(spec()));
-    let renewed = soon(frames.renew(v1::RenewRequest { worker: "w".into() })).await.expect("renewed");
+    let renewed =
+        soon(frames.renew(v1::RenewRequest { worker: "w".into(), leases: vec![lease.id] })).await.expect("renewed");
     assert_eq!(renewed.into_inner().leases, [lease.id]);
 
     drop(opened);
@@ -403,7 +404,8 @@ async fn an_owner_that_goes_away_cancels_its_frame() {
         }
     };
     soon(gone).await;
-    let renewed = soon(frames.renew(v1::RenewRequest { worker: "w".into() })).await.expect("renewed");
+    let renewed =
+        soon(frames.renew(v1::RenewRequest { worker: "w".into(), leases: vec![lease.id] })).await.expect("renewed");
     assert!(renewed.into_inner().leases.is_empty(), "its leases are revoked");
     let late = v1::CompleteRequest { worker: "w".into(), lease: lease.id, frame: lease.frame, ..Default::default() };
     assert!(!soon(frames.complete(late)).await.expect("harmless").into_inner().accepted);

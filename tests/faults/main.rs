@@ -73,8 +73,10 @@ fn farms_survive_what_a_thousand_seeds_do_to_them() {
 
 #[test]
 fn a_seed_replays_exactly() {
-    for seed in 0..20 {
-        let [first, second] = [world::run(seed, true), world::run(seed, true)];
+    worker::farm::log_to_stderr();
+    for seed in 7..8 {
+        eprintln!("RUNRUN");
+        let first = world::run(seed, true); eprintln!("RUNRUN"); let second = world::run(seed, true);
         let differ = first.events.iter().zip(&second.events).find(|(a, b)| a != b);
         assert_eq!(first.digest, second.digest, "seed {seed} differs: {differ:?}");
     }

@@ -189,7 +189,7 @@ impl<J: Job> Worker<J> {
             if asked.is_empty() {
                 continue;
             }
-            let request = v1::RenewRequest { worker: self.name.clone() };
+            let request = v1::RenewRequest { worker: self.name.clone(), leases: asked.iter().copied().collect() };
             let renewed = client::retry(|| {
                 let (mut frames, request) = (self.frames.clone(), request.clone());
                 async move { frames.renew(request).await }

@@ -58,8 +58,8 @@ pub fn read(mut file: impl Read, each: &mut dyn FnMut(Entry) -> Result<(), Strin
                 Err(error) => Err(at(error.to_string())),
             };
         }
-        for entry in value::entries(&payload).map_err(|unsound| at(unsound.to_string()))? {
-            each(entry).map_err(at)?;
+        for entry in value::entries(&payload) {
+            each(entry.map_err(|unsound| at(unsound.to_string()))?).map_err(at)?;
         }
         offset += (HEADER + header.length) as u64;
     }

@@ -95,8 +95,8 @@ impl Journal for Disk {
     fn replay(&mut self, each: &mut dyn FnMut(Entry) -> io::Result<()>) -> io::Result<()> {
         let mut entries = |header: &value::Header, payload: &[u8]| {
             let at = header.sequence;
-            let sound = value::entries(payload).map_err(|e| io::Error::other(format!("append {at}: {e}")))?;
-            sound.into_iter().try_for_each(&mut *each)
+            let unsound = |e: value::Unsound| io::Error::other(format!("append {at}: {e}"));
+            value::entries(payload).try_for_each(|entry| each(entry.map_err(unsound)?))
         };
         let mut failed = None;
         let read = read(self.database()?, |header, payload| {

@@ -86,7 +86,7 @@ impl Found {
         for (_, header) in &self.values {
             if header.sequence > place {
                 gaps.lost.push(place..=header.sequence - 1);
-                gaps.records += header.before.saturating_sub(before);
+                gaps.records = gaps.records.saturating_add(header.before.saturating_sub(before));
             }
             place = header.sequence.saturating_add(1);
             before = header.before.saturating_add(header.records);

@@ -83,9 +83,8 @@ impl Survey {
     pub fn replay(&self, each: &mut dyn FnMut(Entry) -> io::Result<()>) -> io::Result<()> {
         for (at, header) in &self.found.values {
             let payload = salvage::payload(&self.file, *at, header)?;
-            let entries = value::entries(&payload).map_err(io::Error::other);
-            entries
-                .and_then(|entries| entries.into_iter().try_for_each(&mut *each))
+            value::entries(&payload)
+                .try_for_each(|entry| each(entry.map_err(io::Error::other)?))
                 .map_err(|error| io::Error::other(format!("append {}: {error}", header.sequence)))?;
         }
         Ok(())

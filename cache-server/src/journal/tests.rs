@@ -6,6 +6,7 @@ use std::sync::atomic::Ordering;
 use cache_proto::v1::{RecordBatch, entry};
 use memchr::memmem;
 use proptest::prelude::*;
+use prost::Message as _;
 
 use super::device::{Sync, tests as device};
 use super::disk::{self, Disk, FILE};
@@ -292,4 +293,24 @@ fn large_appends_are_split_and_too_large_entries_refused() {
     drop(disk);
     let report = open(directory.path()).1;
     assert_eq!((report.appends, report.records), (4, 30 * 4096));
+}
+
+#[test]
+fn entries_are_read_one_at_a_time_up_to_the_first_that_is_none() {
+    let payload = [&entry(1, 2).encode_length_delimited_to_vec()[..], &[0, 0, 9, 9]].concat();
+    let read: Vec<_> = value::entries(&payload).collect();
+    let none = Entry { entry: None };
+    assert_eq!(read, [Ok(entry(1, 2)), Ok(none.clone()), Ok(none), Err(value::Unsound::Payload)]);
+    assert!(value::entries(&vec![0; value::PAYLOAD_MAX]).take(1).all(|entry| entry.is_ok()));
+}
+
+#[test]
+fn sequence_numbers_of_a_liar_are_counted_without_overflow() {
+    let value = |(sequence, before)| {
+        let value = Place { sequence, before }.seal(&[]);
+        (0, value::Header::read(&value).expect("a header"))
+    };
+    let values = [(2, u64::MAX), (5, 0), (9, u64::MAX)].map(value).to_vec();
+    let gaps = super::salvage::Found { values, ..Default::default() }.gaps();
+    assert_eq!((gaps.lost.len(), gaps.records), (3, u64::MAX));
 }

@@ -198,16 +198,19 @@ pub fn open(bytes: &[u8]) -> Result<(Header, &[u8]), Unsound> {
     header.check(payload).map(|()| (header, payload))
 }
 
-/// The entries of a payload.
-///
-/// # Errors
-/// [`Unsound::Payload`].
-pub fn entries(mut payload: &[u8]) -> Result<Vec<v1::Entry>, Unsound> {
-    let mut entries = Vec::new();
-    while !payload.is_empty() {
-        entries.push(v1::Entry::decode_length_delimited(&mut payload).map_err(|_| Unsound::Payload)?);
-    }
-    Ok(entries)
+/// The entries of a payload, one at a time: in memory one may take a hundred times its bytes. [`Unsound::Payload`] where
+/// none begins, and then no more.
+pub fn entries(mut payload: &[u8]) -> impl Iterator<Item = Result<v1::Entry, Unsound>> {
+    std::iter::from_fn(move || {
+        if payload.is_empty() {
+            return None;
+        }
+        let entry = v1::Entry::decode_length_delimited(&mut payload).map_err(|_| Unsound::Payload);
+        if entry.is_err() {
+            payload = &[];
+        }
+        Some(entry)
+    })
 }
 
 /// How many records an entry holds.
