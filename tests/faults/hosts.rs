@@ -125,7 +125,8 @@ pub async fn sharer(farm: Rc<Farm>) -> turmoil::Result {
             break;
         }
         let count = (random.uniform().powi(4) * SHARED_MAX) as u64 + 1;
-        let ids = (0..count).map(|k| RecordId(u128::from(incarnation) << 96 | u128::from(number) << 32 | u128::from(k)));
+        let ids =
+            (0..count).map(|k| RecordId(u128::from(incarnation) << 96 | u128::from(number) << 32 | u128::from(k)));
         let ids: Vec<_> = ids.collect();
         let records: Vec<_> = ids.iter().map(|id| (Tag::level(1), record(*id, Vec3::X))).collect();
         let inserted = client::retry_for(Duration::MAX, || {

@@ -12,7 +12,7 @@ use worker::client;
 use crate::events::{self, Told};
 use crate::hosts::{self, Farm, SHARED};
 use crate::job;
-use crate::network::{SERVER, connect};
+use crate::network::{self, SERVER, connect};
 use crate::owner::{self, Frame};
 use crate::schedule::{Fault, OWNERS, Planned, SHARER, SLEEPER, STEADY, Schedule, WITNESSES, WORKERS};
 
@@ -37,6 +37,7 @@ const FORGET: Duration = Duration::from_secs(40);
 /// Runs the simulation of a seed.
 pub fn run(seed: u64, keep: bool) -> Told {
     events::begin(keep);
+    network::begin();
     let mut world = World::new(seed);
     if let Err(error) = world.run() {
         events::wrong(error);
@@ -118,7 +119,11 @@ impl World {
                 self.step()?;
             }
             events::note("fault", format_args!("{} {:?}", if begins { "begins" } else { "ends" }, planned.fault));
-            if begins { self.begin(planned) } else { self.end(planned.fault) }
+            if begins {
+                self.begin(planned)?;
+            } else {
+                self.end(planned.fault);
+            }
         }
         Ok(())
     }
@@ -139,7 +144,7 @@ impl World {
         Ok(())
     }
 
-    fn begin(&mut self, planned: Planned) {
+    fn begin(&mut self, planned: Planned) -> Step {
         let host = planned.fault.host();
         match planned.fault {
             Fault::Partition(_) => self.links(host, |sim, peer| sim.partition(host, peer)),
@@ -148,14 +153,14 @@ impl World {
             Fault::Stop(_) => self.links(host, |sim, peer| sim.hold(host, peer)),
             Fault::Drops(_) => self.links(host, |sim, peer| sim.set_link_fail_rate(host, peer, DROPS)),
             Fault::Slow(_) => self.links(host, |sim, peer| sim.set_link_max_message_latency(host, peer, SLOW)),
-            Fault::Crash(_) => self.crash(host),
+            Fault::Crash(_) => self.crash(host)?,
             Fault::PowerLoss(_) => {
                 self.links(host, |sim, peer| sim.partition(host, peer));
-                self.crash(host);
+                self.stop(host);
                 self.links(host, |sim, peer| sim.repair(host, peer));
             }
             Fault::DiskLost => {
-                self.crash(host);
+                self.crash(host)?;
                 self.farm.disk.lose();
                 let held = |id: &_| self.farm.is_held(&SHARED, *id);
                 self.farm.acknowledged.borrow_mut().retain(held);
@@ -164,20 +169,26 @@ impl World {
             Fault::ClockJump(by) => drop(self.farm.clock.send_replace(by)),
             Fault::Away => drop(self.farm.away.send_replace(planned.to - planned.from)),
         }
+        Ok(())
     }
 
     fn end(&mut self, fault: Fault) {
         let host = fault.host();
         let latency = Duration::from_millis(self.schedule.latency);
         match fault {
-            Fault::Partition(_) | Fault::Mute(_) | Fault::Deaf(_) => self.links(host, |sim, peer| sim.repair(host, peer)),
+            Fault::Partition(_) | Fault::Mute(_) | Fault::Deaf(_) => {
+                self.links(host, |sim, peer| sim.repair(host, peer))
+            }
             Fault::Stop(_) => self.links(host, |sim, peer| sim.release(host, peer)),
             Fault::Drops(_) => self.links(host, |sim, peer| {
                 sim.set_link_fail_rate(host, peer, 0.0);
                 sim.repair(host, peer);
             }),
             Fault::Slow(_) => self.links(host, |sim, peer| sim.set_link_max_message_latency(host, peer, latency)),
-            Fault::Crash(_) | Fault::PowerLoss(_) | Fault::DiskLost => self.sim.bounce(host),
+            Fault::Crash(_) | Fault::PowerLoss(_) | Fault::DiskLost => {
+                network::mend(self.sim.lookup(host));
+                self.sim.bounce(host);
+            }
             Fault::DiskFull => self.farm.disk.fill(false),
             Fault::ClockJump(_) | Fault::Away => {}
         }
@@ -198,7 +209,16 @@ impl World {
         [&OWNERS[..owners], &WORKERS[..workers], &WITNESSES, &[SHARER, SLEEPER]].concat()
     }
 
-    fn crash(&mut self, host: &'static str) {
+    /// A machine crashes; its kernel closes the connections.
+    fn crash(&mut self, host: &'static str) -> Step {
+        network::cut(self.sim.lookup(host));
+        self.step()?;
+        self.stop(host);
+        Ok(())
+    }
+
+    /// A machine is no more.
+    fn stop(&mut self, host: &'static str) {
         drop(self.farm.replicas.borrow_mut().remove(host));
         self.sim.crash(host);
         if host == SERVER {
@@ -232,7 +252,8 @@ impl World {
     /// Whether something befalls the server, so that what is published may stay a draft.
     fn server_suffers(&self) -> bool {
         use Fault::{Crash, DiskFull, DiskLost, PowerLoss};
-        let hits = |fault: Fault| fault.host() == SERVER && matches!(fault, Crash(_) | DiskFull | DiskLost | PowerLoss(_));
+        let hits =
+            |fault: Fault| fault.host() == SERVER && matches!(fault, Crash(_) | DiskFull | DiskLost | PowerLoss(_));
         self.schedule.faults.iter().any(|planned| hits(planned.fault))
     }
 
@@ -256,7 +277,9 @@ impl World {
         let Some(told) = told.as_ref() else { return vec!["the server has not answered".into()] };
         let replicas = self.farm.replicas.borrow();
         let mut differences = Vec::new();
-        for (name, (namespace, follower)) in replicas.iter().flat_map(|(name, all)| all.iter().map(move |one| (name, one))) {
+        for (name, (namespace, follower)) in
+            replicas.iter().flat_map(|(name, all)| all.iter().map(move |one| (name, one)))
+        {
             let held = told.namespaces.iter().find(|info| info.namespace == namespace.0[..]);
             let there = held.map_or_else(|| convert::digest_bytes(Default::default()), |info| info.digest.clone());
             let here = follower.read(|replica| convert::digest_bytes(replica.digest()));
@@ -293,12 +316,11 @@ impl World {
     fn leave(&mut self) -> Step {
         self.farm.replicas.borrow_mut().clear();
         for host in self.clients() {
-            self.sim.crash(host);
+            self.crash(host)?;
         }
         let nobody = |told: &v1::InfoResponse| told.subscribers + told.workers + told.frames == 0;
-        let gone = self.until("the server forgot all who left", FORGET, |world| {
-            world.told.borrow().as_ref().is_some_and(nobody)
-        });
+        let gone = self
+            .until("the server forgot all who left", FORGET, |world| world.told.borrow().as_ref().is_some_and(nobody));
         let told = self.told.borrow();
         let left = told.as_ref().map(|told| (told.subscribers, told.workers, told.frames));
         gone.map_err(|error| format!("{error}: subscribers, workers, frames are {left:?}"))

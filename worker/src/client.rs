@@ -125,7 +125,8 @@ pub fn frames(channel: Channel) -> Frames {
 /// the transport as `Cancelled`.
 pub fn is_passing(status: &Status) -> bool {
     let by_transport = std::error::Error::source(status).is_some_and(|source| source.is::<tonic::transport::Error>());
-    by_transport || matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled | Code::DeadlineExceeded)
+    by_transport
+        || matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled | Code::DeadlineExceeded)
 }
 
 /// Waiting times between attempts: doubling from 50 ms to 1 s.

@@ -262,13 +262,7 @@ impl Feed {
 }
 
 /// Gives the server what earlier logs held and this one does not, once it has been read up to `end`.
-async fn refill(
-    mut cache: Cache,
-    namespace: Namespace,
-    held: Arc<Mutex<Held>>,
-    reached: Arc<Progress>,
-    mut end: u64,
-) {
+async fn refill(mut cache: Cache, namespace: Namespace, held: Arc<Mutex<Held>>, reached: Arc<Progress>, mut end: u64) {
     let mut backoff = Backoff::default();
     loop {
         reached.reaches(end).await;
