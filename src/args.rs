@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use worker::client::Address;
+use worker::credentials::{CredentialArgs, Credentials};
 use worker::scene::{self, Camera, Scene};
 use worker::settings::{ALL_BOUNCES, Method, Settings, defaults};
 use worker::{film, spec};
@@ -55,6 +56,9 @@ pub struct RenderArgs {
     /// Use this server, and the workers connected to it: HOST:PORT or unix:PATH
     #[arg(long, value_name = "ADDR")]
     pub server: Option<Address>,
+    /// How to call it.
+    #[command(flatten)]
+    pub credentials: CredentialArgs,
     /// Write statistics as one JSON object
     #[arg(long, value_name = "OUT.json")]
     pub stats: Option<PathBuf>,
@@ -104,6 +108,15 @@ impl RenderArgs {
             taken.push(identity(path));
         }
         Ok(())
+    }
+
+    /// What the server is called with; a server of our own asks nothing.
+    ///
+    /// # Errors
+    /// [`Failure::Usage`].
+    pub fn credentials(&self) -> Result<Credentials, Failure> {
+        let load = |server| self.credentials.load(server).map_err(Failure::usage);
+        self.server.as_ref().map_or(Ok(Credentials::default()), load)
     }
 
     /// The PNG beside the EXR.

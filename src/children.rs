@@ -11,6 +11,7 @@ use tokio::process::{Child, Command};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 use worker::client::Address;
+use worker::credentials::Credentials;
 
 use crate::failure::Failure;
 
@@ -142,12 +143,13 @@ impl Children {
     ///
     /// # Errors
     /// When it cannot be started.
-    pub fn start_worker(&mut self, server: &Address, threads: u16) -> Result<(), Failure> {
+    pub fn start_worker(&mut self, server: &Address, credentials: &Credentials, threads: u16) -> Result<(), Failure> {
         self.started += 1;
         let (name, title) = (worker::farm::unique_name(), format!("worker {}", self.started));
         let mut command = self.command("worker");
         command.arg("--server").arg(server.to_string());
         command.args(["--threads", &threads.to_string(), "--name", &name]);
+        command.args(credentials.insecure().then_some("--insecure")).envs(credentials.environment());
         let child = command.spawn().map_err(|e| Failure::failed(format!("cannot start a worker: {e}")))?;
         let ended = {
             let (name, title) = (name.clone(), title.clone());
@@ -193,6 +195,10 @@ impl Children {
         let mut command = Command::new(&self.program);
         command.arg(subcommand).args(["--exit-with-parent", &std::process::id().to_string()]);
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).kill_on_drop(true);
+        // Ours are for somebody else's server.
+        for variable in Credentials::VARIABLES {
+            command.env_remove(variable);
+        }
         if std::env::var_os("RUST_LOG").is_none() {
             command.env("RUST_LOG", "warn");
         }

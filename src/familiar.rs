@@ -5,6 +5,7 @@ use std::path::Path;
 
 use cache_proto::v1::{FrameSpec, InfoRequest, Label};
 use worker::client::{self, Address};
+use worker::credentials::Credentials;
 use worker::settings::ALL_BOUNCES;
 
 use crate::failure::Failure;
@@ -13,10 +14,15 @@ use crate::failure::Failure;
 ///
 /// # Errors
 /// When the server does not answer.
-pub async fn note(server: &Address, spec: &FrameSpec, cache: &Path) -> Result<Option<String>, Failure> {
-    let channel = client::connect(server);
+pub async fn note(
+    server: &Address,
+    credentials: &Credentials,
+    spec: &FrameSpec,
+    cache: &Path,
+) -> Result<Option<String>, Failure> {
+    let line = client::connect(server, credentials).map_err(Failure::usage)?;
     let asked = client::retry(|| {
-        let mut cache = client::cache(channel.clone());
+        let mut cache = client::cache(line.clone());
         async move { cache.info(InfoRequest {}).await }
     });
     let info = asked.await.map_err(|status| Failure::failed(format!("server {server}: {}", status.message())))?;

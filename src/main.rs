@@ -101,7 +101,10 @@ fn main() -> ExitCode {
         Command::Worker { worker, owned } => {
             owned.watch();
             worker::farm::log_to_stderr();
-            worker::farm::block_on(worker).map_err(|e| Failure::failed(format!("{e:#}")))
+            let credentials = worker.credentials.load(&worker.server).map_err(Failure::usage);
+            credentials.and_then(|credentials| {
+                worker::farm::block_on(worker, &credentials).map_err(|e| Failure::failed(format!("{e:#}")))
+            })
         }
         Command::Compare(args) => compare::run(&args),
         Command::Cache(command) => cache::run(&command),

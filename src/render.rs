@@ -9,6 +9,7 @@ use cache_proto::{VERSION, v1};
 use serde_json::{Map, Value, json};
 use tonic::{Status, Streaming};
 use worker::client::{self, Address, Frames};
+use worker::credentials::Credentials;
 use worker::film::{self, Film};
 use worker::frame::Frame;
 use worker::scene::{self, Scene};
@@ -42,11 +43,12 @@ const PROBES: u32 = 24;
 /// What went wrong, with the exit code it means.
 pub async fn run(args: RenderArgs) -> Result<(), Failure> {
     args.check()?;
+    let credentials = args.credentials()?;
     let mut children = Children::new()?;
     let ended = tokio::select! {
         biased;
         number = signalled() => Err(Failure::Signal(number)),
-        ended = render(&args, &mut children) => ended,
+        ended = render(&args, credentials, &mut children) => ended,
     };
     children.stop().await;
     ended
@@ -77,7 +79,7 @@ async fn signalled() -> u8 {
     2
 }
 
-async fn render(args: &RenderArgs, children: &mut Children) -> Result<(), Failure> {
+async fn render(args: &RenderArgs, credentials: Credentials, children: &mut Children) -> Result<(), Failure> {
     let (mut stats, mut progress) = (Stats::default(), Progress::new(args.quiet, args.workers() > 0));
     stats.phase("load");
     progress.phase("loading the scene");
@@ -90,7 +92,7 @@ async fn render(args: &RenderArgs, children: &mut Children) -> Result<(), Failur
         progress.note(&format!("warning: {warning}"));
     }
     let declined = HashSet::new();
-    let mut render = Render { args, children, stats, progress, spare: RESTARTS, base: None, declined };
+    let mut render = Render { args, credentials, children, stats, progress, spare: RESTARTS, base: None, declined };
     let (film, done) = render.picture(&job).await?;
     // Reaped first, so that their memory is in the statistics.
     render.children.stop().await;
@@ -146,6 +148,7 @@ struct Base {
 
 struct Render<'a> {
     args: &'a RenderArgs,
+    credentials: Credentials,
     children: &'a mut Children,
     stats: Stats,
     progress: Progress,
@@ -199,17 +202,20 @@ impl Render<'_> {
             None => self.children.start_server(self.args.transport, self.args.cache.as_deref()).await?,
         };
         if let Some(cache) = &self.args.cache {
-            familiar::note(&server, &job.spec, cache).await?.iter().for_each(|note| self.progress.note(note));
+            familiar::note(&server, &self.credentials, &job.spec, cache)
+                .await?
+                .iter()
+                .for_each(|note| self.progress.note(note));
         }
         self.stats.workers = self.args.workers().into();
         for _ in 0..self.args.workers() {
-            self.children.start_worker(&server, self.args.threads)?;
+            self.children.start_worker(&server, &self.credentials, self.args.threads)?;
         }
         Ok(server)
     }
 
     async fn attempt(&mut self, job: &Job, server: &Address, film: &mut Film) -> Result<End, Failure> {
-        let frames = client::frames(client::connect(server));
+        let frames = client::frames(client::connect(server, &self.credentials).map_err(Failure::usage)?);
         let mut events = match self.open(job, server, &frames).await? {
             Ok(events) => events,
             Err(end) => return Ok(end),
@@ -288,7 +294,7 @@ impl Render<'_> {
                 let again = self.spare > 0;
                 if again {
                     self.spare -= 1;
-                    self.children.start_worker(server, self.args.threads)?;
+                    self.children.start_worker(server, &self.credentials, self.args.threads)?;
                 }
                 let what = if again { "starting another" } else { "going on without it" };
                 self.progress.note(&format!("warning: {title} ended, {}; {what}", how(status)));

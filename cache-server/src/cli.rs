@@ -106,6 +106,9 @@ pub async fn run(args: ServeArgs) -> Result<(), ServeError> {
 fn open(directory: &Path) -> Result<Box<dyn Journal>, ServeError> {
     let (journal, report) = Disk::open(directory, Sync::Device).map_err(no_data)?;
     tracing::info!(directory = %directory.display(), records = report.records, "recovered");
+    if let Some(torn) = report.torn {
+        tracing::warn!("{}: append {torn} was begun before a crash and is not whole", directory.display());
+    }
     if let Some(damage) = report.damage {
         tracing::warn!("{} {damage}", directory.display());
     }

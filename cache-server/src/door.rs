@@ -12,6 +12,7 @@ use tokio::time::Sleep;
 use tokio_stream::Stream;
 use tonic::transport::server::Connected;
 
+use crate::inflow::Holding;
 use crate::metrics;
 
 /// A connection that brings no call it may make within this time is cut, whatever it does instead: nothing, half a
@@ -54,7 +55,7 @@ impl Door {
         if before >= self.most + TOLD {
             return None;
         }
-        let pass = Pass { full, called: Arc::default() };
+        let pass = Pass { full, called: Arc::default(), holding: Arc::default() };
         let greeting = Some(Box::pin(tokio::time::sleep(GREETING)));
         Some(Guest { io, pass, greeting, _count: count })
     }
@@ -112,9 +113,15 @@ where
 pub struct Pass {
     full: Option<usize>,
     called: Arc<AtomicBool>,
+    holding: Holding,
 }
 
 impl Pass {
+    /// What this connection holds of messages that are not whole.
+    pub fn holding(&self) -> &Holding {
+        &self.holding
+    }
+
     /// The bound of connections, if this one is past it.
     pub fn full(&self) -> Option<usize> {
         self.full

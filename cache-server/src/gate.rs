@@ -15,7 +15,7 @@ use tracing::Instrument as _;
 
 use crate::access::{Tenant, Tokens};
 use crate::door::Pass;
-use crate::inflow::Inflow;
+use crate::inflow::{Holding, Inflow};
 use crate::metrics;
 use crate::refusal::Refusal;
 
@@ -39,10 +39,11 @@ impl Gate {
         Self { tokens: Arc::new(tokens), inflow: Arc::new(Inflow::new(inflow)), calls: Arc::default() }
     }
 
-    /// Whether a call may be made; then its request carries its [`Tenant`].
-    fn admit(&self, request: &mut Request<Body>) -> Result<(), Refusal> {
+    /// Whether a call may be made; then its request carries its [`Tenant`], and is counted.
+    fn admit(&self, mut request: Request<Body>) -> Result<Request<Body>, Refusal> {
         let pass = request.extensions().get::<Pass>().cloned();
-        if !self.is_open(request.uri().path()) {
+        let holding = pass.as_ref().map_or_else(Holding::default, |pass| pass.holding().clone());
+        if !is_open(request.uri().path()) {
             if let Some(most) = pass.as_ref().and_then(Pass::full) {
                 return Err(Refusal::Connections(most));
             }
@@ -54,12 +55,8 @@ impl Gate {
                 pass.stay();
             }
         }
-        Ok(())
-    }
-
-    /// Whether anybody may call it: probes of health carry no tokens.
-    fn is_open(&self, path: &str) -> bool {
-        path.starts_with("/grpc.health.v1.Health/")
+        let inflow = self.inflow.clone();
+        Ok(request.map(|body| inflow.count(holding, body)))
     }
 
     fn request_id(&self, headers: &HeaderMap) -> HeaderValue {
@@ -71,6 +68,11 @@ impl Gate {
         let own = || self.calls.fetch_add(1, Ordering::Relaxed).into();
         headers.get(REQUEST_ID).filter(sane).cloned().unwrap_or_else(own)
     }
+}
+
+/// Whether anybody may call it: probes of health carry no tokens. A connection does not stay for them alone.
+fn is_open(path: &str) -> bool {
+    path.starts_with("/grpc.health.v1.Health/")
 }
 
 impl<S> Layer<S> for Gate {
@@ -101,15 +103,12 @@ where
         self.inner.poll_ready(context)
     }
 
-    fn call(&mut self, mut request: Request<Body>) -> Self::Future {
+    fn call(&mut self, request: Request<Body>) -> Self::Future {
         let method = metrics::method(request.uri().path());
         let id = self.gate.request_id(request.headers());
         let shown = id.to_str().unwrap_or_default();
         let span = tracing::info_span!("call", method, request = shown, tenant = tracing::field::Empty);
-        let answer = span.in_scope(|| self.gate.admit(&mut request)).map(|()| {
-            let inflow = self.gate.inflow.clone();
-            self.inner.call(request.map(|body| inflow.count(body)))
-        });
+        let answer = span.in_scope(|| self.gate.admit(request)).map(|request| self.inner.call(request));
         let answered = async move {
             let mut response = match answer {
                 Ok(answer) => answer.await?,

@@ -1,6 +1,6 @@
-//! Bytes of messages that are on their way: a server takes only so many at a time, whoever sends them. A message may be
-//! long and a connection may carry many calls, so that without this bound a few peers that send all but the last byte
-//! would fill its memory.
+//! Bytes of messages that are on their way: a message may be long and a connection may carry many calls, so that without
+//! a bound a few peers that send all but the last byte would fill the memory. A connection has room for one message of its
+//! own, whatever others do; beyond that all share what is left.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -16,28 +16,56 @@ use crate::refusal::Refusal;
 /// Length of what stands before each message of gRPC: a flag, and its length in four bytes.
 const PREFIX: usize = 5;
 
-/// Counts what has come of messages that are not whole yet, over all calls.
+/// What a connection may always hold, bytes: the longest message of an insert or a query.
+const OWN: usize = 2 << 20;
+
+/// Counts what has come of messages that are not whole yet, over all calls of all connections.
 #[derive(Debug)]
 pub struct Inflow {
     most: usize,
-    held: AtomicUsize,
+    /// What connections hold beyond their own room.
+    shared: AtomicUsize,
 }
 
+/// What one connection holds, bytes.
+pub type Holding = Arc<AtomicUsize>;
+
 impl Inflow {
-    /// At most so many bytes.
+    /// At most so many bytes beyond what each connection may always hold.
     pub fn new(most: usize) -> Self {
-        Self { most, held: AtomicUsize::new(0) }
+        Self { most, shared: AtomicUsize::new(0) }
     }
 
-    /// A call's request, counted.
-    pub fn count(self: Arc<Self>, body: Body) -> Body {
-        Body::new(Flow { inflow: self, body, held: 0, prefix: [0; PREFIX], prefix_held: 0, rest: 0 })
+    /// The request of a call of a connection, counted.
+    pub fn count(self: Arc<Self>, holding: Holding, body: Body) -> Body {
+        Body::new(Flow { inflow: self, holding, body, held: 0, prefix: [0; PREFIX], prefix_held: 0, rest: 0 })
     }
+
+    fn grow(&self, holding: &Holding, bytes: usize) -> Result<(), Refusal> {
+        let before = holding.fetch_add(bytes, Ordering::Relaxed);
+        let beyond = beyond(before + bytes) - beyond(before);
+        let shared = self.shared.fetch_add(beyond, Ordering::Relaxed) + beyond;
+        if beyond > 0 && shared > self.most {
+            return Err(Refusal::Full { what: "bytes of messages under way", most: self.most });
+        }
+        Ok(())
+    }
+
+    fn shrink(&self, holding: &Holding, bytes: usize) {
+        let before = holding.fetch_sub(bytes, Ordering::Relaxed);
+        self.shared.fetch_sub(beyond(before) - beyond(before - bytes), Ordering::Relaxed);
+    }
+}
+
+/// How much of what a connection holds is not in its own room.
+fn beyond(held: usize) -> usize {
+    held.saturating_sub(OWN)
 }
 
 /// The request of one call. Its reader asks for more only when it has taken every whole message.
 struct Flow {
     inflow: Arc<Inflow>,
+    holding: Holding,
     body: Body,
     /// Bytes counted for this call: what has come of a message that is not whole.
     held: usize,
@@ -71,14 +99,12 @@ impl Flow {
                 (self.prefix_held, held) = (0, 0);
             }
         }
-        let more = held.saturating_sub(self.held);
-        let less = self.held.saturating_sub(held);
-        self.held = held;
-        self.inflow.held.fetch_sub(less, Ordering::Relaxed);
-        if self.inflow.held.fetch_add(more, Ordering::Relaxed) + more > self.inflow.most && more > 0 {
-            return Err(Refusal::Full { what: "bytes of messages under way", most: self.inflow.most });
+        let before = std::mem::replace(&mut self.held, held);
+        if held < before {
+            self.inflow.shrink(&self.holding, before - held);
+            return Ok(());
         }
-        Ok(())
+        self.inflow.grow(&self.holding, held - before)
     }
 }
 
@@ -111,7 +137,7 @@ impl http_body::Body for Flow {
 
 impl Drop for Flow {
     fn drop(&mut self) {
-        self.inflow.held.fetch_sub(self.held, Ordering::Relaxed);
+        self.inflow.shrink(&self.holding, self.held);
     }
 }
 
@@ -119,45 +145,47 @@ impl Drop for Flow {
 mod tests {
     use super::*;
 
-    fn flow(inflow: &Arc<Inflow>) -> Flow {
-        let inflow = inflow.clone();
-        Flow { inflow, body: Body::empty(), held: 0, prefix: [0; PREFIX], prefix_held: 0, rest: 0 }
+    fn flow(inflow: &Arc<Inflow>, holding: &Holding) -> Flow {
+        let (inflow, holding) = (inflow.clone(), holding.clone());
+        Flow { inflow, holding, body: Body::empty(), held: 0, prefix: [0; PREFIX], prefix_held: 0, rest: 0 }
     }
 
     #[test]
     fn what_is_not_whole_is_counted_however_it_is_cut() {
         let lengths = [0usize, 1, 300, 7, 0];
-        let mut bytes = Vec::new();
+        let (mut bytes, mut ends) = (Vec::new(), vec![0]);
         for length in lengths {
             bytes.push(0);
             bytes.extend((length as u32).to_be_bytes());
             bytes.extend(vec![9; length]);
+            ends.push(bytes.len());
         }
-        let ends: Vec<_> =
-            lengths.iter().scan(0, |end, length| Some(std::mem::replace(end, *end + 5 + length))).collect();
         for step in 1..=bytes.len() {
-            let inflow = Arc::new(Inflow::new(1 << 20));
-            let mut flow = flow(&inflow);
+            let holding = Holding::default();
+            let mut flow = flow(&Arc::new(Inflow::new(1 << 20)), &holding);
             for (at, piece) in bytes.chunks(step).enumerate() {
                 flow.take(piece).expect("room");
                 let come = at * step + piece.len();
-                let whole = ends.iter().copied().chain([bytes.len()]).filter(|&end| end <= come).max().expect("0");
-                assert_eq!(inflow.held.load(Ordering::Relaxed), come - whole, "step {step}, {come} bytes");
+                let whole = ends.iter().copied().filter(|&end| end <= come).max().expect("0");
+                assert_eq!(holding.load(Ordering::Relaxed), come - whole, "step {step}, {come} bytes");
             }
         }
     }
 
     #[test]
-    fn past_the_bound_a_call_is_refused_and_its_end_makes_room() {
+    fn past_the_bound_the_greedy_are_refused_and_the_modest_are_not() {
         let inflow = Arc::new(Inflow::new(1000));
-        let begun = [&[0u8, 0, 1, 0, 0][..], &[7; 600]].concat();
-        let (mut first, mut second) = (flow(&inflow), flow(&inflow));
-        first.take(&begun).expect("room");
-        assert!(second.take(&begun).expect_err("full").to_string().contains("1000"));
+        let (greedy, modest) = (Holding::default(), Holding::default());
+        let begun = |bytes: usize| [&[0u8, 0xff, 0, 0, 0][..], &vec![7; bytes - PREFIX]].concat();
+        let (mut first, mut second) = (flow(&inflow, &greedy), flow(&inflow, &greedy));
+        first.take(&begun(OWN)).expect("its own");
+        second.take(&begun(1000)).expect("shared");
+        assert!(second.take(&[7]).expect_err("full").to_string().contains("1000"));
+        flow(&inflow, &modest).take(&begun(OWN)).expect("its own");
+        assert_eq!(modest.load(Ordering::Relaxed), 0, "a call that ends makes room");
         drop(second);
-        assert!(flow(&inflow).take(&[0, 0, 0, 0, 9]).is_ok());
+        flow(&inflow, &greedy).take(&begun(1000)).expect("shared");
         drop(first);
-        assert!(flow(&inflow).take(&begun).is_ok());
-        assert_eq!(inflow.held.load(Ordering::Relaxed), 0);
+        assert_eq!((greedy.load(Ordering::Relaxed), inflow.shared.load(Ordering::Relaxed)), (0, 0));
     }
 }

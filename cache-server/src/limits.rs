@@ -16,7 +16,7 @@ pub struct Limits {
     pub connections: usize,
     /// Most calls at once on one connection.
     pub calls: usize,
-    /// Most bytes of messages that have begun to come and are not whole yet, over all connections.
+    /// Most bytes of messages that have begun to come and are not whole yet, beyond 2 MiB of each connection.
     pub inflow: usize,
     /// Most subscriptions.
     pub subscribers: usize,
@@ -53,9 +53,11 @@ const ANY: RangeInclusive<usize> = 1..=1 << 20;
 const BOUNDS: [Bound; 9] = [
     bound("records", "records in all namespaces together", 32 << 20, 1..=1 << 40, |l| &mut l.records),
     bound("namespaces", "namespaces, drafts of frames among them", 1024, ANY, |l| &mut l.namespaces),
-    bound("connections", "connections; each may use 2 MiB", 2048, ANY, |l| &mut l.connections),
+    bound("connections", "connections; each may use 4 MiB", 2048, ANY, |l| &mut l.connections),
     bound("calls", "calls at once on one connection", 256, 8..=1 << 16, |l| &mut l.calls),
-    bound("inflow", "bytes of messages that are not whole yet", 256 << 20, 8 << 20..=1 << 40, |l| &mut l.inflow),
+    bound("inflow", "bytes of unfinished messages beyond 2 MiB a connection", 256 << 20, 8 << 20..=1 << 40, |l| {
+        &mut l.inflow
+    }),
     bound("subscribers", "subscriptions", 8192, ANY, |l| &mut l.subscribers),
     bound("frames", "frames open at once", 64, ANY, |l| &mut l.frames),
     bound("workers", "workers", 4096, ANY, |l| &mut l.workers),

@@ -111,7 +111,7 @@ impl Board {
                 self.open.retain(|open| *open != frame);
             }
         }
-        drop(self.frames.take_changes());
+        self.frames.take_changes();
     }
 
     fn open(&mut self, spec: v1::FrameSpec) {

@@ -92,7 +92,7 @@ fn sound(scene: Scene, seed: u8) {
     let origin = world.center + Vec3::new(0.3, f32::from(seed) / 64.0, 2.0) * world.radius;
     for target in targets {
         if let Some(direction) = (target - origin).try_normalize() {
-            drop(world.meet(origin, direction));
+            world.meet(origin, direction);
         }
     }
 }

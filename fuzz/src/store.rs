@@ -23,7 +23,9 @@ const CRASHED: u8 = 2;
 /// The first byte chooses the file: the bytes that follow, a journal patched by them, or values placed by them.
 pub fn store(data: &[u8]) {
     let Some((kind, rest)) = data.split_first() else { return };
-    drop(value::open(rest).map(|(_, payload)| value::entries(payload).count()));
+    if let Ok((_, payload)) = value::open(rest) {
+        value::entries(payload).for_each(drop);
+    }
     let (bytes, written) = match kind % 4 {
         RAW => (rest.to_vec(), Vec::new()),
         CLOSED => (patched(file(true), rest), appends().concat()),

@@ -1,17 +1,23 @@
 //! The connection to a server: addresses, channels, and which calls are worth repeating.
 
+use std::error::Error;
 use std::future::Future;
 use std::io;
+use std::net::IpAddr;
 use std::path::PathBuf;
 use std::str::FromStr;
+use std::sync::LazyLock;
 use std::time::Duration;
 
 use cache_proto::v1;
 use hyper_util::rt::TokioIo;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::time::Instant;
-use tonic::transport::{Channel, Endpoint, Uri};
+use tonic::service::interceptor::InterceptedService;
+use tonic::transport::{Channel, ClientTlsConfig, Endpoint, Uri};
 use tonic::{Code, Response, Status};
+
+use crate::credentials::{Bearer, Credentials};
 
 /// How long a server may be away before its clients give up.
 pub const PATIENCE: Duration = Duration::from_secs(30);
@@ -38,6 +44,21 @@ pub enum Address {
     Unix(PathBuf),
 }
 
+impl Address {
+    /// Whether what is sent there stays on this machine.
+    pub fn is_local(&self) -> bool {
+        let Self::Tcp(at) = self else { return true };
+        let host = host(at);
+        host == "localhost" || host.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
+    }
+}
+
+/// The host of `HOST:PORT`, without the brackets of IPv6.
+fn host(at: &str) -> &str {
+    let host = at.rsplit_once(':').map_or(at, |(host, _)| host);
+    host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(host)
+}
+
 impl FromStr for Address {
     type Err = String;
 
@@ -62,29 +83,59 @@ impl std::fmt::Display for Address {
     }
 }
 
-/// A channel to `address`. It connects with the first call and again whenever the connection was lost, so an absent
-/// server shows as `Unavailable` there, not here.
-pub fn connect(address: &Address) -> Channel {
-    match address.clone() {
-        Address::Tcp(at) => connect_with(move || {
-            let at = at.clone();
-            async move {
-                let stream = tokio::net::TcpStream::connect(at).await?;
-                stream.set_nodelay(true)?;
-                Ok(stream)
-            }
-        }),
+/// A connection to a server: whatever is called over it carries the token.
+pub type Line = InterceptedService<Channel, Bearer>;
+
+/// A line to `address`. It connects with the first call and again whenever the connection was lost, so an absent server
+/// shows as `Unavailable` there, not here.
+///
+/// # Errors
+/// When the authority's certificate cannot be used.
+pub fn connect(address: &Address, credentials: &Credentials) -> Result<Line, String> {
+    let channel = match address.clone() {
+        Address::Tcp(at) => {
+            let endpoint = endpoint(&at, credentials)?;
+            channel(&endpoint, move || {
+                let at = at.clone();
+                async move {
+                    let stream = tokio::net::TcpStream::connect(at).await?;
+                    stream.set_nodelay(true)?;
+                    Ok(stream)
+                }
+            })
+        }
         #[cfg(unix)]
-        Address::Unix(path) => connect_with(move || tokio::net::UnixStream::connect(path.clone())),
+        Address::Unix(path) => channel(&NAMELESS, move || tokio::net::UnixStream::connect(path.clone())),
         #[cfg(not(unix))]
-        Address::Unix(_) => connect_with(|| async {
+        Address::Unix(_) => channel(&NAMELESS, || async {
             Err::<tokio::net::TcpStream, _>(io::Error::new(io::ErrorKind::Unsupported, "no Unix sockets here"))
         }),
-    }
+    };
+    Ok(InterceptedService::new(channel, credentials.bearer()))
 }
 
-/// A channel whose bytes travel over whatever `open` opens: a socket, or a simulated one.
-pub fn connect_with<O, F, S>(open: O) -> Channel
+/// Where it does not matter what the Host header says, because `open` knows where to go.
+static NAMELESS: LazyLock<Endpoint> = LazyLock::new(|| Endpoint::from_static("http://ambience"));
+
+/// The server at `HOST:PORT`; its certificate has to be for that host, if an authority is to vouch for it.
+fn endpoint(at: &str, credentials: &Credentials) -> Result<Endpoint, String> {
+    let Some(authority) = credentials.certificate() else { return Ok(NAMELESS.clone()) };
+    let tls = ClientTlsConfig::new().ca_certificate(authority).domain_name(host(at)).timeout(CONNECT);
+    let endpoint = Endpoint::from_shared(format!("https://{at}")).and_then(|endpoint| endpoint.tls_config(tls));
+    endpoint.map_err(|error| format!("--tls-ca: {}", cause(&error)))
+}
+
+/// A line whose bytes travel over whatever `open` opens: a simulated socket, say. No token, no encryption.
+pub fn connect_with<O, F, S>(open: O) -> Line
+where
+    O: Fn() -> F + Send + 'static,
+    F: Future<Output = io::Result<S>> + Send + 'static,
+    S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+{
+    InterceptedService::new(channel(&NAMELESS, open), Bearer::default())
+}
+
+fn channel<O, F, S>(endpoint: &Endpoint, open: O) -> Channel
 where
     O: Fn() -> F + Send + 'static,
     F: Future<Output = io::Result<S>> + Send + 'static,
@@ -94,8 +145,8 @@ where
         let opening = open();
         async move { opening.await.map(TokioIo::new) }
     });
-    // The name is only what the Host header says; `open` knows where to go.
-    Endpoint::from_static("http://ambience")
+    endpoint
+        .clone()
         .connect_timeout(CONNECT)
         .http2_keep_alive_interval(KEEP_ALIVE)
         .keep_alive_timeout(KEEP_ALIVE)
@@ -106,19 +157,19 @@ where
 }
 
 /// Client of the Cache service.
-pub type Cache = v1::cache_client::CacheClient<Channel>;
+pub type Cache = v1::cache_client::CacheClient<Line>;
 
 /// Client of the Frames service.
-pub type Frames = v1::frames_client::FramesClient<Channel>;
+pub type Frames = v1::frames_client::FramesClient<Line>;
 
-/// Client of the Cache service over `channel`.
-pub fn cache(channel: Channel) -> Cache {
-    Cache::new(channel)
+/// Client of the Cache service over `line`.
+pub fn cache(line: Line) -> Cache {
+    Cache::new(line)
 }
 
-/// Client of the Frames service over `channel`, with room for many tiles in one message.
-pub fn frames(channel: Channel) -> Frames {
-    Frames::new(channel).max_decoding_message_size(FRAMES_MESSAGE_MAX).max_encoding_message_size(FRAMES_MESSAGE_MAX)
+/// Client of the Frames service over `line`, with room for many tiles in one message.
+pub fn frames(line: Line) -> Frames {
+    Frames::new(line).max_decoding_message_size(FRAMES_MESSAGE_MAX).max_encoding_message_size(FRAMES_MESSAGE_MAX)
 }
 
 /// Whether an idempotent call that failed so may succeed when repeated. A cut stream comes as `Unknown`, a timeout of
@@ -127,6 +178,23 @@ pub fn is_passing(status: &Status) -> bool {
     let by_transport = std::error::Error::source(status).is_some_and(|source| source.is::<tonic::transport::Error>());
     by_transport
         || matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled | Code::DeadlineExceeded)
+}
+
+/// Why a server's certificate was not accepted, if that is what a call failed for: repeating it would not mend that.
+fn distrust(status: &Status) -> Option<Status> {
+    let tls = chain(status)
+        .filter_map(|error| error.downcast_ref::<io::Error>())
+        .find(|error| error.kind() == io::ErrorKind::InvalidData);
+    tls.map(|error| Status::failed_precondition(format!("no trust in the encrypted connection: {error}")))
+}
+
+/// The innermost reason of an error; those around it say less.
+fn cause(error: &(dyn Error + 'static)) -> String {
+    chain(error).last().unwrap_or(error).to_string()
+}
+
+fn chain<'a>(error: &'a (dyn Error + 'static)) -> impl Iterator<Item = &'a (dyn Error + 'static)> {
+    std::iter::successors(Some(error), |error| (*error).source())
 }
 
 /// Waiting times between attempts: doubling from 50 ms to 1 s.
@@ -174,7 +242,10 @@ where
         let status = match answer {
             Ok(Ok(response)) => return Ok(response.into_inner()),
             Ok(Err(status)) if !is_passing(&status) => return Err(status),
-            Ok(Err(status)) => status,
+            Ok(Err(status)) => match distrust(&status) {
+                Some(distrust) => return Err(distrust),
+                None => status,
+            },
             Err(_) => Status::deadline_exceeded(format!("no answer within {} s", ATTEMPT.as_secs())),
         };
         let since = *failing.get_or_insert_with(Instant::now);

@@ -15,7 +15,8 @@ use tokio::time::Instant;
 use tonic::{Code, Status};
 use tracing::{debug, info, warn};
 
-use crate::client::{self, Address, Backoff, Cache, Frames};
+use crate::client::{self, Address, Backoff, Cache, Frames, Line};
+use crate::credentials::{CredentialArgs, Credentials};
 use crate::follow;
 use crate::frame::Frame;
 use crate::job::{Dropped, Job, Work};
@@ -49,15 +50,19 @@ pub struct WorkerArgs {
     /// Name towards the server, at most 64 bytes.
     #[arg(long, hide = true)]
     pub name: Option<String>,
+    /// How to call it.
+    #[command(flatten)]
+    pub credentials: CredentialArgs,
 }
 
 /// Works for a server until a signal ends it: SIGTERM, SIGINT, or its terminal going away.
 ///
 /// # Errors
 /// The server is of another version, or has been away for [`client::PATIENCE`].
-pub async fn run(args: WorkerArgs) -> anyhow::Result<()> {
+pub async fn run(args: WorkerArgs, credentials: &Credentials) -> anyhow::Result<()> {
     let threads = args.threads.map_or_else(|| cores().min(THREADS_MAX as usize), usize::from);
-    let worker = Arc::new(Worker::<Frame>::new(args.name.unwrap_or_else(unique_name), client::connect(&args.server)));
+    let line = client::connect(&args.server, credentials).map_err(anyhow::Error::msg)?;
+    let worker = Arc::new(Worker::<Frame>::new(args.name.unwrap_or_else(unique_name), line));
     info!(name = worker.name, %args.server, threads, "working");
     let ended = tokio::select! {
         lost = worker.clone().work(threads) => Err(lost),
@@ -80,9 +85,9 @@ pub async fn run(args: WorkerArgs) -> anyhow::Result<()> {
 ///
 /// # Errors
 /// As [`run`].
-pub fn block_on(args: WorkerArgs) -> anyhow::Result<()> {
+pub fn block_on(args: WorkerArgs, credentials: &Credentials) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
-    let ended = runtime.block_on(run(args));
+    let ended = runtime.block_on(run(args, credentials));
     runtime.shutdown_background();
     ended
 }
@@ -145,14 +150,14 @@ pub struct Worker<J> {
 }
 
 impl<J: Job> Worker<J> {
-    /// A worker named `name` for the server behind `channel`.
-    pub fn new(name: String, channel: tonic::transport::Channel) -> Self {
-        let cache = client::cache(channel.clone());
+    /// A worker named `name` for the server behind `line`.
+    pub fn new(name: String, line: Line) -> Self {
+        let cache = client::cache(line.clone());
         Self {
             name,
             shelf: Shelf::new(cache.clone()),
             cache,
-            frames: client::frames(channel),
+            frames: client::frames(line),
             held: Mutex::default(),
             declined: Mutex::default(),
         }

@@ -15,6 +15,7 @@
 //! - [`frame`]: the two kinds of work a worker leases: filling rounds and making pixels.
 //! - [`solo`]: a frame without a farm.
 //! - [`spec`]: settings on the wire.
+//! - [`credentials`]: tokens and certificates, as a client has them.
 //! - [`client`]: the connection to a server.
 //! - [`replica`]: a copy of a namespace's log.
 //! - [`caches`]: what a step may read, sealed: a prefix of one log, lower steps of another.
@@ -49,6 +50,7 @@ pub mod solo;
 
 pub mod caches;
 pub mod client;
+pub mod credentials;
 pub mod farm;
 pub mod follow;
 pub mod job;

@@ -17,11 +17,19 @@ struct Args {
 fn main() -> ExitCode {
     let args = Args::parse();
     farm::log_to_stderr();
-    match farm::block_on(args.worker) {
+    // Nobody is left to tell if that fails.
+    let say = |why: String| drop(writeln!(std::io::stderr(), "worker: {why}"));
+    let credentials = match args.worker.credentials.load(&args.worker.server) {
+        Ok(credentials) => credentials,
+        Err(why) => {
+            say(why);
+            return ExitCode::from(2);
+        }
+    };
+    match farm::block_on(args.worker, &credentials) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
-            // Nobody is left to tell if that fails.
-            drop(writeln!(std::io::stderr(), "worker: {e:#}"));
+            say(format!("{e:#}"));
             ExitCode::FAILURE
         }
     }

@@ -104,12 +104,12 @@ async fn completed(script: &Script, lease: u64) -> (u64, u64) {
     (count(&found, "queries"), count(&found, "reused"))
 }
 
-fn at_work(channel: tonic::transport::Channel) -> tokio::task::JoinHandle<Status> {
+fn at_work(channel: worker::client::Line) -> tokio::task::JoinHandle<Status> {
     tokio::spawn(Arc::new(Worker::<Tiles>::new("worker".into(), channel)).work(1))
 }
 
 /// A follower that has read a log of these.
-async fn follower(script: &Script, channel: &tonic::transport::Channel, ids: std::ops::Range<u128>) -> Follower {
+async fn follower(script: &Script, channel: &worker::client::Line, ids: std::ops::Range<u128>) -> Follower {
     let end = ids.end - ids.start;
     script.insert(SCENE, &ids.map(|id| entry(id, 0)).collect::<Vec<_>>());
     let follower = Follower::start(client::cache(channel.clone()), SCENE);

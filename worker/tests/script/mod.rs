@@ -13,8 +13,9 @@ use cache_proto::{convert, v1};
 use tokio::sync::{mpsc, watch};
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_stream::{Stream, StreamExt as _};
-use tonic::transport::{Channel, Server};
+use tonic::transport::Server;
 use tonic::{Request, Response, Status, Streaming};
+use worker::client::Line;
 
 type Log = RecordSet<Irradiance>;
 
@@ -49,7 +50,7 @@ pub struct Script {
 
 impl Script {
     /// Starts it; the channel leads there.
-    pub fn start() -> (Self, Channel) {
+    pub fn start() -> (Self, Line) {
         let script = Self { state: Arc::default(), changed: Arc::new(watch::channel((0, 0)).0) };
         let (connections, accepted) = mpsc::channel::<std::io::Result<_>>(8);
         let channel = worker::client::connect_with(move || {
