@@ -12,10 +12,10 @@ use cache_proto::v1;
 use cache_proto::v1::cache_server::Cache;
 use tokio::time::Sleep;
 use tokio_stream::Stream;
-use tokio_stream::wrappers::WatchStream;
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::access::{Tenant, tenant};
+use crate::bell::Listener;
 use crate::frames_service::Board;
 use crate::query::Queries;
 use crate::refusal::Refusal;
@@ -147,7 +147,7 @@ impl Insert {
 /// its own socket and holds nobody back.
 pub struct Subscription {
     store: Counted,
-    grown: WatchStream<bool>,
+    grown: Listener,
     /// It was told something and is told no more for a while.
     rest: Option<Pin<Box<Sleep>>>,
     tenant: Tenant,
@@ -160,7 +160,7 @@ pub struct Subscription {
 
 impl Subscription {
     fn new(store: &Arc<Store>, tenant: Tenant, namespace: Namespace, position: u64) -> Result<Self, Refusal> {
-        let grown = WatchStream::from_changes(store.grown().listen());
+        let grown = store.grown().listen();
         let store = store.count_subscriber()?;
         Ok(Self { store, grown, rest: None, tenant, namespace, position, started: false, ended: false })
     }

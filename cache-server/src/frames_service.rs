@@ -12,11 +12,10 @@ use cache_proto::v1;
 use cache_proto::v1::frames_server::Frames as FramesTrait;
 use prost::Message as _;
 use tokio_stream::Stream;
-use tokio_stream::wrappers::WatchStream;
 use tonic::{Request, Response, Status};
 
 use crate::access::{Tenant, tenant};
-use crate::bell::Bell;
+use crate::bell::{Bell, Listener};
 use crate::clock::Clock;
 use crate::frame::{News, Origin};
 use crate::frames::{Changes, Frames};
@@ -151,7 +150,8 @@ impl Board {
                 return mark;
             }
             tokio::select! {
-                _ = grown.changed(), if !self.store.grown().is_closed() => (),
+                biased;
+                () = grown.changed(), if !self.store.grown().is_closed() => (),
                 () = &mut wait => return self.store.mark(namespace),
             }
         }
@@ -170,7 +170,8 @@ impl Board {
                 return Ok(Some(lease));
             }
             tokio::select! {
-                _ = work.changed() => (),
+                biased;
+                () = work.changed() => (),
                 () = &mut wait => return Ok(None),
             }
         }
@@ -283,7 +284,7 @@ fn named(tenant: &Tenant, worker: &str) -> Result<String, Refusal> {
 /// What the owner of a frame hears. Dropping it cancels the frame.
 pub struct Owner {
     board: Arc<Board>,
-    news: WatchStream<bool>,
+    news: Listener,
     frame: u64,
     draft: Namespace,
     ended: bool,
@@ -291,7 +292,7 @@ pub struct Owner {
 
 impl Owner {
     fn new(board: Arc<Board>, frame: u64, draft: Namespace) -> Self {
-        let news = WatchStream::from_changes(board.news.listen());
+        let news = board.news.listen();
         Self { board, news, frame, draft, ended: false }
     }
 

@@ -175,7 +175,9 @@ pub fn frames(line: Line) -> Frames {
 /// Whether an idempotent call that failed so may succeed when repeated. A cut stream comes as `Unknown`, a timeout of
 /// the transport as `Cancelled`.
 pub fn is_passing(status: &Status) -> bool {
-    matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled | Code::DeadlineExceeded)
+    let by_transport = std::error::Error::source(status).is_some_and(|source| source.is::<tonic::transport::Error>());
+    by_transport
+        || matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled | Code::DeadlineExceeded)
 }
 
 /// Why a server's certificate was not accepted, if that is what a call failed for: repeating it would not mend that.

@@ -26,7 +26,7 @@ const REST: Duration = Duration::from_secs(30);
 /// A replica and the task that feeds it. Dropping it ends the subscription.
 pub struct Follower {
     held: Arc<Mutex<Held>>,
-    reached: watch::Receiver<Reached>,
+    reached: Arc<Progress>,
     /// The last epoch whose log is not to be followed any more.
     left: watch::Sender<u64>,
     wanted: Arc<Notify>,
@@ -50,6 +50,34 @@ struct Reached {
     refused: Option<Status>,
 }
 
+/// What is reached, and who waits for it: woken in the order in which they began to wait, so that a simulation of a
+/// farm replays.
+struct Progress {
+    reached: Mutex<Reached>,
+    changed: Notify,
+}
+
+impl Progress {
+    fn now(&self) -> Reached {
+        lock(&self.reached).clone()
+    }
+
+    fn change(&self, change: impl FnOnce(&mut Reached)) {
+        change(&mut lock(&self.reached));
+        self.changed.notify_waiters();
+    }
+
+    async fn reaches(&self, position: u64) {
+        loop {
+            let changed = self.changed.notified();
+            if self.now().position >= position {
+                return;
+            }
+            changed.await;
+        }
+    }
+}
+
 impl Drop for Follower {
     fn drop(&mut self) {
         self.task.abort();
@@ -60,14 +88,15 @@ impl Follower {
     /// Subscribes to `namespace`.
     pub fn start(cache: Cache, namespace: Namespace) -> Self {
         let held = Arc::new(Mutex::new(Held { replica: Replica::new(namespace), aside: None }));
-        let (sender, reached) = watch::channel(Reached { epoch: 1, ..Reached::default() });
+        let reached = Mutex::new(Reached { epoch: 1, ..Reached::default() });
+        let reached = Arc::new(Progress { reached, changed: Notify::new() });
         let (left, leaving) = watch::channel(0);
         let (wanted, received) = (Arc::new(Notify::new()), Arc::new(AtomicU64::new(0)));
         let feed = Feed {
             cache,
             namespace,
             held: held.clone(),
-            reached: sender,
+            reached: reached.clone(),
             left: leaving,
             wanted: wanted.clone(),
             received: received.clone(),
@@ -85,26 +114,22 @@ impl Follower {
     /// # Errors
     /// The server does not let us read the namespace.
     pub async fn reaches(&self, position: u64, dropped: &Dropped) -> Result<bool, Status> {
-        let mut here = self.reached.clone();
         loop {
-            {
-                let now = here.borrow_and_update();
-                if let Some(status) = &now.refused {
-                    return Err(status.clone());
-                }
-                // What is to be left does not count.
-                if now.epoch > *self.left.borrow() && now.position >= position {
-                    return Ok(true);
-                }
+            let changed = self.reached.changed.notified();
+            let now = self.reached.now();
+            if let Some(status) = now.refused {
+                return Err(status);
+            }
+            // What is to be left does not count.
+            if now.epoch > *self.left.borrow() && now.position >= position {
+                return Ok(true);
             }
             if dropped() {
                 return Ok(false);
             }
             self.wanted.notify_one();
-            // Ran out of time, or the subscription ended for good: look again, at the same pace.
-            if let Ok(Err(_)) = tokio::time::timeout(LOOK, here.changed()).await {
-                tokio::time::sleep(LOOK).await;
-            }
+            // Look again now and then, whether or not something came.
+            drop(tokio::time::timeout(LOOK, changed).await);
         }
     }
 
@@ -136,7 +161,7 @@ struct Feed {
     cache: Cache,
     namespace: Namespace,
     held: Arc<Mutex<Held>>,
-    reached: watch::Sender<Reached>,
+    reached: Arc<Progress>,
     left: watch::Receiver<u64>,
     wanted: Arc<Notify>,
     received: Arc<AtomicU64>,
@@ -152,7 +177,7 @@ impl Feed {
             match self.subscribe().await {
                 Ok(()) => debug!("the subscription ended"),
                 Err(status) if matches!(status.code(), Code::PermissionDenied | Code::Unauthenticated) => {
-                    return self.reached.send_modify(|reached| reached.refused = Some(status));
+                    return self.reached.change(|reached| reached.refused = Some(status));
                 }
                 Err(status) if status.code() == Code::NotFound => {
                     // A published draft: nothing comes any more, unless a frame fills it again or the server is lost.
@@ -169,7 +194,7 @@ impl Feed {
     }
 
     fn here(&self) -> (u64, u64) {
-        let reached = self.reached.borrow();
+        let reached = self.reached.now();
         (reached.epoch, reached.position)
     }
 
@@ -195,7 +220,7 @@ impl Feed {
             start => return Err(Status::internal(format!("the stream starts at {start}, asked for {position}"))),
         }
         let mut refilling = lock(&self.held).aside.is_some();
-        let refill = refill(self.cache.clone(), self.namespace, self.held.clone(), self.reached.subscribe(), first.end);
+        let refill = refill(self.cache.clone(), self.namespace, self.held.clone(), self.reached.clone(), first.end);
         let mut refill = pin!(refill);
         loop {
             tokio::select! {
@@ -220,7 +245,7 @@ impl Feed {
             warn!("{e}");
             Status::internal(e.to_string())
         })?;
-        self.reached.send_modify(|reached| reached.position = position);
+        self.reached.change(|reached| reached.position = position);
         Ok(())
     }
 
@@ -232,23 +257,15 @@ impl Feed {
             None => held.aside = Some(old),
         }
         let epoch = held.replica.epoch();
-        self.reached.send_modify(|reached| (reached.epoch, reached.position) = (epoch, 0));
+        self.reached.change(|reached| (reached.epoch, reached.position) = (epoch, 0));
     }
 }
 
 /// Gives the server what earlier logs held and this one does not, once it has been read up to `end`.
-async fn refill(
-    mut cache: Cache,
-    namespace: Namespace,
-    held: Arc<Mutex<Held>>,
-    mut reached: watch::Receiver<Reached>,
-    mut end: u64,
-) {
+async fn refill(mut cache: Cache, namespace: Namespace, held: Arc<Mutex<Held>>, reached: Arc<Progress>, mut end: u64) {
     let mut backoff = Backoff::default();
     loop {
-        if reached.wait_for(|reached| reached.position >= end).await.is_err() {
-            return;
-        }
+        reached.reaches(end).await;
         let mut from = 0;
         // Looked up before each batch: others hold the same records and give them back at the same time.
         while let Some((records, next)) = lacking(&held, from).await {
