@@ -188,6 +188,14 @@ fn distrust(status: &Status) -> Option<Status> {
     tls.map(|error| Status::failed_precondition(format!("no trust in the encrypted connection: {error}")))
 }
 
+/// What a server that encrypts answers to a client that does not is no HTTP/2, and nobody would know why.
+fn explained(status: Status) -> Status {
+    if status.code() != Code::Internal || !status.message().starts_with("h2 protocol error") {
+        return status;
+    }
+    Status::internal(format!("{}; if the server encrypts, give --tls-ca", status.message()))
+}
+
 /// The innermost reason of an error; those around it say less.
 fn cause(error: &(dyn Error + 'static)) -> String {
     chain(error).last().unwrap_or(error).to_string()
@@ -241,7 +249,7 @@ where
         let answer = tokio::time::timeout(ATTEMPT, call()).await;
         let status = match answer {
             Ok(Ok(response)) => return Ok(response.into_inner()),
-            Ok(Err(status)) if !is_passing(&status) => return Err(status),
+            Ok(Err(status)) if !is_passing(&status) => return Err(explained(status)),
             Ok(Err(status)) => match distrust(&status) {
                 Some(distrust) => return Err(distrust),
                 None => status,
