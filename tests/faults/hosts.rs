@@ -9,6 +9,7 @@ use std::time::Duration;
 use cache_core::id::Random;
 use cache_core::{Namespace, RecordId, Tag};
 use cache_proto::v1;
+use cache_proto::v1::cache_client::CacheClient;
 use cache_server::{Config, Node, serve_on};
 use glam::Vec3;
 use tokio::sync::watch;
@@ -144,8 +145,8 @@ pub async fn sharer(farm: Rc<Farm>) -> turmoil::Result {
 
 /// Follows what is shared, and the namespace of the frames, for as long as it runs.
 pub async fn witness(farm: Rc<Farm>, name: &'static str, frames: Namespace) -> turmoil::Result {
-    let channel = connect();
-    let follow = |namespace| (namespace, Follower::start(client::cache(channel.clone()), namespace));
+    let line = connect();
+    let follow = |namespace| (namespace, Follower::start(client::cache(line.clone()), namespace));
     farm.replicas.borrow_mut().insert(name, [SHARED, frames].map(follow).into());
     std::future::pending().await
 }
@@ -153,7 +154,7 @@ pub async fn witness(farm: Rc<Farm>, name: &'static str, frames: Namespace) -> t
 /// Subscribes and never reads.
 pub async fn sleeper() -> turmoil::Result {
     loop {
-        let mut cache = client::cache(connect_narrow());
+        let mut cache = CacheClient::new(connect_narrow());
         let request = v1::SubscribeRequest { namespace: SHARED.0.to_vec().into(), ..Default::default() };
         if let Ok(stream) = cache.subscribe(request).await {
             tokio::time::sleep(Duration::from_secs(3600)).await;

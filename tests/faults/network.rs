@@ -14,6 +14,7 @@ use tokio_stream::Stream;
 use tonic::transport::server::Connected;
 use tonic::transport::{Channel, Endpoint};
 use turmoil::net::{TcpListener, TcpStream};
+use worker::client::{self, Line};
 
 /// Name of the one server.
 pub const SERVER: &str = "server";
@@ -137,9 +138,9 @@ async fn open() -> io::Result<Socket> {
     Socket::new(TcpStream::connect((SERVER, PORT)).await?)
 }
 
-/// A channel to the server, as clients open it.
-pub fn connect() -> Channel {
-    worker::client::connect_with(open)
+/// A line to the server, as clients open it.
+pub fn connect() -> Line {
+    client::connect_with(open)
 }
 
 /// A channel to the server that takes in little at a time: 64 KiB, HTTP/2's default.
