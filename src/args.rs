@@ -276,7 +276,7 @@ mod tests {
 
         let check = |rest: &[&str]| usage(args(rest).check());
         assert_eq!(check(&["--error", "0.1"]), "--error is not available yet");
-        assert_eq!(check(&["--cache", "x"]), "--cache is not available yet");
+        assert_eq!(check(&["--cache", "Cargo.toml"]), "--cache Cargo.toml: expected a directory");
         assert!(check(&["--workers", "0"]).starts_with("--workers 0 needs --server"));
         assert!(check(&["--stats", "/no/such/folder/s.json"]).starts_with("--stats /no/such/folder/s.json: cannot"));
         let mut other = args(&[]);

@@ -50,7 +50,7 @@ fn wrong_usage_is_one_line() {
     with(&["--method", "magic"], &["magic", "irradiance"]);
     with(&["--camera", "nobody"], &["nobody", "camera"]);
     with(&["--error", "0.02"], &["--error", "not available yet"]);
-    with(&["--cache", "somewhere"], &["--cache", "not available yet"]);
+    with(&["--cache", &cornell], &["--cache", "expected a directory"]);
     with(&["--server", "nonsense"], &["nonsense"]);
     with(&["--stats", &out], &["--stats", "out.exr", "another file"]);
     with(&["--stats", &out.replace(".exr", ".png")], &["--stats", "out.png", "another file"]);
