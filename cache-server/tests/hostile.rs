@@ -244,7 +244,7 @@ async fn records_that_are_none() {
         ("position", spoil(|r| r.position.y = f32::INFINITY)),
         ("normal", spoil(|r| r.normal *= 2.0)),
         ("radius", spoil(|r| r.radius = 0.0)),
-        ("radius", spoil(|r| r.radius = f32::from_bits(1) * -1.0)),
+        ("radius", spoil(|r| r.radius = -f32::from_bits(1))),
         ("radius", spoil(|r| r.radius_max = f32::NAN)),
         ("gradient", spoil(|r| r.gradient_t[1].x = f32::NEG_INFINITY)),
     ];

@@ -20,6 +20,7 @@ fn limits() -> Limits {
 }
 
 /// What happens to a replica.
+#[allow(clippy::large_enum_variant, reason = "there are few at a time")]
 pub enum Step {
     Entry(Checked<Irradiance>),
     Hold(Namespace),

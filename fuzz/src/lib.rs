@@ -21,8 +21,11 @@ pub use record::record;
 pub use scene::scene;
 pub use store::store;
 
+/// A name, and what it checks.
+type Target = (&'static str, fn(&[u8]));
+
 /// The targets by name.
-pub const TARGETS: [(&str, fn(&[u8])); 5] =
+pub const TARGETS: [Target; 5] =
     [("record", record), ("batch", batch), ("store", store), ("scene", scene), ("frame", frame)];
 
 /// Cuts bytes into pieces, each a kind, a length in two bytes, and its bytes.

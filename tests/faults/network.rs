@@ -21,9 +21,11 @@ pub const SERVER: &str = "server";
 
 const PORT: u16 = 4670;
 
+/// The sockets of a host, oldest first; `None` when it is about to crash.
+type Sockets = Option<Vec<Weak<Mutex<Inner>>>>;
+
 thread_local! {
-    /// The sockets of each host, oldest first; `None` for a host that is about to crash.
-    static SOCKETS: RefCell<BTreeMap<IpAddr, Option<Vec<Weak<Mutex<Inner>>>>>> = RefCell::default();
+    static SOCKETS: RefCell<BTreeMap<IpAddr, Sockets>> = RefCell::default();
 }
 
 /// A simulated connection as tonic wants it.
