@@ -193,7 +193,8 @@ fn code_name(code: Code) -> &'static str {
 mod tests {
     #[test]
     fn the_page_for_operators_tells_of_every_metric() {
-        let named = include_str!("metrics.rs").split('"').filter(|name| name.starts_with("ambience_"));
+        let named =
+            include_str!("metrics.rs").split('"').filter(|name| name.starts_with("ambience_") && *name != "ambience_");
         for name in named {
             let row = format!("| `{name}` |");
             assert!(include_str!("../../docs/operating.md").contains(&row), "docs/operating.md has no row {row}");
