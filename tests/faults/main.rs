@@ -8,6 +8,21 @@
 //! - [`owner`]: who opens frames, and checks the pictures.
 //! - [`schedule`]: what goes wrong, drawn from a seed.
 //! - [`world`]: one simulation and its checks.
+//!
+//! `AMBIENCE_SEEDS=N` or `FROM..TO` runs other seeds than the first thousand, `AMBIENCE_SEED=N` replays one and tells
+//! what happened (`RUST_LOG` adds what the services say). All that is up to chance comes from the seed.
+//!
+//! Simulated: delay, and order between connections; partitions, loss in one direction, lost messages (a connection with
+//! a gap stands still until its keep-alive ends it), processes that are stopped, crashes and lost power of every machine,
+//! a disk that is lost or full (of a failed append some may be there), a server's clock that jumps ahead, a subscriber
+//! that never reads, owners who go away. The server knows no other clock than one that never goes back, so no simulated
+//! one does.
+//!
+//! Not simulated: the kernel, and TCP's own retransmission; TLS and tokens; real disks, thus the redb journal and what a
+//! torn write leaves (its own tests do that) and a crash in the middle of an append; threads, of which every simulated
+//! machine has one, so that no two of its tasks ever run at the same time; real time, so no deadline is missed because a
+//! machine is slow; memory running out; a log longer than some thousand records; the renderer, whose records are made up;
+//! peers that lie.
 
 mod disk;
 mod events;
