@@ -77,7 +77,7 @@ mod tests {
     #[test]
     fn the_reason_names_what_differs() {
         let (scene_hash, rays, bounces, a) = (vec![1; 32], 512, ALL_BOUNCES, 0.3);
-        let scene = "/home/x/room.glb".into();
+        let scene = "/scenes/room.glb".into();
         let spec = FrameSpec { scene, scene_hash: scene_hash.clone().into(), rays, bounces, a, ..Default::default() };
         let scene = "room.glb".into();
         let same = Label { scene, scene_hash: scene_hash.into(), rays, bounces, a, ..Default::default() };

@@ -4,6 +4,7 @@
 //! Entries wait in a bounded queue; whatever stands there when the journal is free is made durable together. The
 //! replica's lock is held for the time of one entry at most and never across an await.
 
+use std::collections::BTreeMap;
 use std::io;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
@@ -48,6 +49,8 @@ struct Shared {
 struct Pending {
     entry: Entry,
     checked: Checked<Irradiance>,
+    /// Whose batch or label it is; publications are the server's own.
+    tenant: Option<String>,
     kept: oneshot::Sender<Result<Added, Refusal>>,
 }
 
@@ -58,7 +61,8 @@ impl Keeping {
     /// Waits until it is durable and can be read by others. It then may be acknowledged.
     ///
     /// # Errors
-    /// [`Refusal::Full`] or [`Refusal::Journal`]; nothing of the entry is used then. [`Refusal::Closing`].
+    /// [`Refusal::Full`], [`Refusal::Foreign`] or [`Refusal::Journal`]; nothing of the entry is used then.
+    /// [`Refusal::Closing`].
     pub async fn kept(self) -> Result<Added, Refusal> {
         self.0.await.unwrap_or(Err(Refusal::Closing))
     }
@@ -93,7 +97,7 @@ impl Store {
         if let Checked::Batch(namespace, ..) = &checked {
             self.claim(tenant, namespace).await?;
         }
-        self.queue(entry, checked).await
+        self.queue(entry, checked, Some(tenant.into())).await
     }
 
     /// Makes a namespace a tenant's, unless it belongs to somebody. Nobody's namespaces need no label for that.
@@ -130,12 +134,18 @@ impl Store {
     async fn keep(&self, entry: Kind) -> Result<Added, Refusal> {
         let entry = Entry { entry: Some(entry) };
         let checked = convert::entry(&entry)?;
-        self.queue(entry, checked).await?.kept().await
+        let tenant = if let Checked::Label(_, _, label) = &checked { Some(label.owner.clone()) } else { None };
+        self.queue(entry, checked, tenant).await?.kept().await
     }
 
-    async fn queue(&self, entry: Entry, checked: Checked<Irradiance>) -> Result<Keeping, Refusal> {
+    async fn queue(
+        &self,
+        entry: Entry,
+        checked: Checked<Irradiance>,
+        tenant: Option<String>,
+    ) -> Result<Keeping, Refusal> {
         let (kept, keeping) = oneshot::channel();
-        let pending = Pending { entry, checked, kept };
+        let pending = Pending { entry, checked, tenant, kept };
         self.queue.send(pending).await.map_err(|_| Refusal::Closing)?;
         Ok(Keeping(keeping))
     }
@@ -229,18 +239,26 @@ impl Writer {
         }
     }
 
-    /// Those there is room for, should all of their records be new.
+    /// Those whose namespaces are their tenants', and that there is room for, should all of their records be new.
+    ///
+    /// Who asked before may have been overtaken: whose a namespace is, the first label here decides.
     fn admitted(&self, group: Vec<Pending>) -> Vec<Pending> {
-        let (mut admitted, mut count) = (Vec::with_capacity(group.len()), 0);
+        let (mut admitted, mut count, mut begun) = (Vec::with_capacity(group.len()), 0, BTreeMap::new());
         for pending in group {
-            let room = match &pending.checked {
-                Checked::Batch(namespace, _, records) => {
+            let admit = |replica: &mut Replica| match (&pending.checked, &pending.tenant) {
+                (Checked::Batch(namespace, _, records), Some(tenant)) => {
+                    replica.belongs(namespace, tenant)?;
                     count += records.len();
-                    self.shared.write(|replica| replica.admit(namespace, count))
+                    replica.admit(namespace, count)
+                }
+                (Checked::Label(namespace, ..), Some(tenant)) => {
+                    replica.belongs(namespace, tenant)?;
+                    let owner = begun.entry(*namespace).or_insert_with(|| tenant.clone());
+                    if owner == tenant { Ok(()) } else { Err(Refusal::Foreign(*namespace)) }
                 }
                 _ => Ok(()),
             };
-            match room {
+            match self.shared.write(admit) {
                 Ok(()) => admitted.push(pending),
                 Err(refusal) => drop(pending.kept.send(Err(refusal))),
             }
@@ -298,4 +316,44 @@ impl Drop for Counted {
 /// Locks, whether or not another holder panicked: every change under these locks is whole before anything can panic.
 pub(crate) fn lock<T: ?Sized>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use cache_core::{RecordId, Tag};
+    use glam::{Vec2, Vec3};
+
+    use super::*;
+    use crate::journal::Nowhere;
+
+    fn batch(id: u128) -> RecordBatch {
+        let record = Irradiance {
+            id: RecordId(id),
+            position: Vec3::ZERO,
+            normal: Vec3::Z,
+            radius: 1.0,
+            radius_min: 0.1,
+            radius_max: 10.0,
+            irradiance: Vec3::ONE,
+            gradient_t: [Vec2::ZERO; 3],
+            gradient_r: [Vec2::ZERO; 3],
+        };
+        convert::pack(&Namespace([7; 32]), Tag::level(1), [&record])
+    }
+
+    /// Both ask before either is heard; "a" would be the smaller label, "b" comes first.
+    #[tokio::test]
+    async fn of_two_tenants_that_begin_a_namespace_at_once_one_is_refused() {
+        let (store, writer) = Store::open(Limits::default(), Box::new(Nowhere)).expect("nothing to read");
+        let insert = async |tenant: &'static str, id| store.insert(tenant, batch(id)).await?.kept().await;
+        let (first, second) = tokio::select! {
+            biased;
+            both = async { tokio::join!(insert("b", 1), insert("a", 2)) } => both,
+            () = writer.run() => panic!("the store lives"),
+        };
+        assert_eq!(first.map(|added| added.added).map_err(|refusal| refusal.to_string()), Ok(1));
+        assert!(matches!(second, Err(Refusal::Foreign(_))));
+        assert_eq!(store.mark(&Namespace([7; 32])).sum.records, 1);
+        assert!(store.replica().belongs(&Namespace([7; 32]), "b").is_ok());
+    }
 }
