@@ -75,7 +75,7 @@ fn line(id: u32, level: u32) -> String {
         "{{\"type\":\"record\",\"namespace\":\"{namespace}\",\"kind\":\"irradiance\",\"level\":{level},\"step\":0,\
          \"id\":\"{id:032x}\",\"position\":[{id}.5,2.0,3.0],\"normal\":[0.0,0.0,1.0],\"radius\":1.0,\"radius_min\":0.1,\
          \"radius_max\":10.0,\"irradiance\":[1.0,2.0,3.0],\"gradient_t\":[[0.0,0.1],[0.2,0.3],[0.4,0.5]],\
-         \"gradient_r\":[[0.0,0.1],[0.2,0.3],[0.4,0.5]]}}\n"
+         \"gradient_r\":[[0.0,0.1],[0.2,0.3],[0.4,0.5]],\"ellipse\":[1.0,0.5,1.0],\"noise\":0.25}}\n"
     )
 }
 

@@ -23,7 +23,7 @@ type Failed = Box<dyn std::error::Error>;
 
 fn main() -> Result<(), Failed> {
     let records: u64 = std::env::args().nth(1).map_or(Ok(1_000_000), |count| count.parse())?;
-    println!("{records} records of 112 bytes");
+    println!("{records} records of 128 bytes");
     println!("{:44} {:>9} {:>12} {:>9}", "", "seconds", "records/s", "MB");
     for size in [256, 4096] {
         for (sync, waits) in [(Sync::Device, "device"), (Sync::PageCache, "page cache")] {
@@ -92,6 +92,8 @@ fn batch(ids: std::ops::Range<u64>) -> Entry {
         irradiance: Vec3::ONE,
         gradient_t: [Vec2::ONE; 3],
         gradient_r: [Vec2::ONE; 3],
+        ellipse: [0.0; 3],
+        noise: 0.0,
     };
     let records: Vec<_> = ids.map(record).collect();
     Entry { entry: Some(entry::Entry::Batch(convert::pack(&Namespace([1; 32]), Tag::level(1), &records))) }

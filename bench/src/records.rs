@@ -38,6 +38,8 @@ pub fn at(site: &[f32], radius: f32) -> Irradiance {
         irradiance: Vec3::new(next(), next(), next()),
         gradient_t: [(); 3].map(|()| Vec2::new(next(), next())),
         gradient_r: [(); 3].map(|()| Vec2::new(next(), next())),
+        ellipse: [0.0; 3],
+        noise: 0.0,
     }
 }
 

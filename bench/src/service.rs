@@ -200,7 +200,7 @@ async fn follow(
 
 async fn read(mut stream: Streaming<v1::SubscribeResponse>, count: u64) -> Result<(), tonic::Status> {
     let mut bytes = 0;
-    while bytes < count as usize * 112
+    while bytes < count as usize * 128
         && let Some(response) = stream.message().await?
     {
         bytes += response.batch.map_or(0, |batch| batch.records.len());

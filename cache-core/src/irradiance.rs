@@ -36,6 +36,11 @@ pub struct Irradiance {
     pub gradient_t: [Vec2; 3],
     /// ∇_r E_i, W/m² per radian, per channel: change when the normal turns about the site's tangents.
     pub gradient_r: [Vec2; 3],
+    /// (xx, xy, yy) of M along the site's tangents, 1/m²: the record counts out to (p - p_i)ᵀ M (p - p_i) = a², an ellipse
+    /// whose semi-axes say how far the gradients hold (Schwarzhaupt 2012). All 0: as far as R alone lets it.
+    pub ellipse: [f32; 3],
+    /// Standard error of E_i, root mean square over the channels, W/m².
+    pub noise: f32,
 }
 
 /// What a query of irradiance gets.
@@ -48,7 +53,7 @@ pub struct Answer {
 }
 
 /// Wire and memory order of the float fields after the id.
-const FLOATS: usize = 24;
+const FLOATS: usize = 28;
 
 /// Weights are kept below this, so that a query on the site itself stays finite.
 const ERROR_MIN: f32 = 1e-4;
@@ -141,6 +146,8 @@ impl Cached for Irradiance {
             irradiance: Vec3::new(f[9], f[10], f[11]),
             gradient_t: pairs(12),
             gradient_r: pairs(18),
+            ellipse: [f[24], f[25], f[26]],
+            noise: f[27],
         };
         record.check().map(|()| record)
     }
@@ -155,7 +162,7 @@ const IN_FRONT_TOLERANCE: f32 = 0.01;
 impl Irradiance {
     fn floats(&self) -> [f32; FLOATS] {
         let [p, n, e] = [self.position, self.normal, self.irradiance];
-        let [t, r] = [self.gradient_t, self.gradient_r];
+        let ([t, r], m) = ([self.gradient_t, self.gradient_r], self.ellipse);
         [
             p.x,
             p.y,
@@ -181,6 +188,10 @@ impl Irradiance {
             r[1].y,
             r[2].x,
             r[2].y,
+            m[0],
+            m[1],
+            m[2],
+            self.noise,
         ]
     }
 
@@ -189,7 +200,7 @@ impl Irradiance {
     /// # Errors
     /// The first field that is not.
     pub fn check(&self) -> Result<(), Invalid> {
-        const FIELDS: [(&str, usize); 8] = [
+        const FIELDS: [(&str, usize); 10] = [
             ("position", 3),
             ("normal", 3),
             ("radius", 1),
@@ -198,6 +209,8 @@ impl Irradiance {
             ("irradiance", 3),
             ("gradient_t", 6),
             ("gradient_r", 6),
+            ("ellipse", 3),
+            ("noise", 1),
         ];
         let floats = self.floats();
         // All at once: which one it was is seldom asked.
@@ -228,6 +241,15 @@ impl Irradiance {
             let expected = "at least radius_min";
             return Err(Invalid::Range { field: "radius_max", value: self.radius_max, expected });
         }
+        let [xx, xy, yy] = self.ellipse.map(f64::from);
+        // A record reaches as far as R lets it at most, so an ellipse without end in some direction does no harm.
+        if xx < 0.0 || yy < 0.0 || xy * xy > xx * yy * (1.0 + 1e-5) {
+            let expected = "no negative axis";
+            return Err(Invalid::Range { field: "ellipse", value: self.ellipse[1], expected });
+        }
+        if self.noise < 0.0 {
+            return Err(Invalid::Range { field: "noise", value: self.noise, expected: "0 or more" });
+        }
         if self.irradiance.min_element() < 0.0 {
             let value = self.irradiance.min_element();
             return Err(Invalid::Range { field: "irradiance", value, expected: "0 or more" });
@@ -251,6 +273,8 @@ mod tests {
             irradiance: Vec3::new(1.0, 2.0, 3.0),
             gradient_t: [Vec2::new(0.1, 0.2); 3],
             gradient_r: [Vec2::new(0.3, -0.4); 3],
+            ellipse: [0.0; 3],
+            noise: 0.0,
         }
     }
 
@@ -269,7 +293,7 @@ mod tests {
     #[test]
     fn unsound_records_are_refused_by_name() {
         type Spoil = fn(&mut Irradiance);
-        let spoilt: [(&str, Spoil); 8] = [
+        let spoilt: [(&str, Spoil); 11] = [
             ("position", |r| r.position.x = f32::NAN),
             ("gradient_r", |r| r.gradient_r[2].y = f32::INFINITY),
             ("radius", |r| r.radius = f32::INFINITY),
@@ -278,6 +302,9 @@ mod tests {
             ("radius", |r| r.radius = 0.0),
             ("radius_min", |r| r.radius_min = -1.0),
             ("radius_max", |r| r.radius_max = 0.01),
+            ("ellipse", |r| r.ellipse = [1.0, 2.0, 1.0]),
+            ("ellipse", |r| r.ellipse = [1.0, 0.0, f32::NAN]),
+            ("noise", |r| r.noise = -1.0),
         ];
         for (field, spoil) in spoilt {
             let mut record = sound();

@@ -142,6 +142,8 @@ mod tests {
                 irradiance: Vec3::new(v[2], v[3], v[4]),
                 gradient_t: [Vec2::new(v[5], v[6]); 3],
                 gradient_r: [Vec2::new(v[7], v[8]); 3],
+                ellipse: [0.0; 3],
+                noise: 0.0,
             },
         )
     }

@@ -337,6 +337,8 @@ mod tests {
             irradiance: Vec3::ONE,
             gradient_t: [Vec2::ZERO; 3],
             gradient_r: [Vec2::ZERO; 3],
+            ellipse: [0.0; 3],
+            noise: 0.0,
         };
         convert::pack(&Namespace([7; 32]), Tag::level(1), [&record])
     }

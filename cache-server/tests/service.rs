@@ -89,6 +89,8 @@ fn record(id: u32) -> Irradiance {
         irradiance: Vec3::new(1.0 + x, 2.0, 3.0),
         gradient_t: [Vec2::new(0.1, 0.2); 3],
         gradient_r: [Vec2::new(0.3, -0.4); 3],
+        ellipse: [0.0; 3],
+        noise: 0.0,
     }
 }
 
@@ -181,7 +183,7 @@ async fn a_bad_batch_is_refused_by_name_and_the_connection_stays_usable() {
         ("kind 9", v1::RecordBatch { kind: 9, ..good.clone() }),
         ("level is 0", v1::RecordBatch { level: 0, ..good.clone() }),
         ("at most 4096", convert::pack(&NAMESPACE, Tag::level(1), &records(0..4097))),
-        ("expected 112", v1::RecordBatch { records: good.records.slice(1..113 + 5), ..good.clone() }),
+        ("expected 128", v1::RecordBatch { records: good.records.slice(1..129 + 5), ..good.clone() }),
     ];
     for (named, batch) in spoilt {
         let refused = insert(&mut cache, vec![good.clone(), batch]).await.expect_err(named);

@@ -113,6 +113,8 @@ fn record(byte: u8) -> Irradiance {
         irradiance: Vec3::ONE,
         gradient_t: [Vec2::ZERO; 3],
         gradient_r: [Vec2::ZERO; 3],
+        ellipse: [0.0; 3],
+        noise: 0.0,
     }
 }
 

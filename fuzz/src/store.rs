@@ -86,7 +86,7 @@ fn held(disk: &mut Disk) -> Option<Vec<Entry>> {
 
 /// An entry unlike that of any other number.
 fn entry(number: u8, records: usize) -> Entry {
-    let bytes: Vec<u8> = (0..records * 112).map(|i| (i as u8).wrapping_mul(number) ^ number).collect();
+    let bytes: Vec<u8> = (0..records * 128).map(|i| (i as u8).wrapping_mul(number) ^ number).collect();
     let namespace = vec![number; 32].into();
     let batch = RecordBatch { namespace, kind: 1, level: 1, records: bytes.into(), step: number.into() };
     Entry { entry: Some(Kind::Batch(batch)) }

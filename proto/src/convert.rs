@@ -234,8 +234,8 @@ mod tests {
             step: 0,
         };
         let message = |b: &v1::RecordBatch| unpack::<Irradiance>(b).expect_err("unsound").to_string();
-        assert!(message(&batch(vec![0; 113])).starts_with("record 0 of the batch: normal"));
-        assert!(message(&batch(vec![0; 4097 * 112])).contains("at most 4096"));
+        assert!(message(&batch(vec![0; 129])).starts_with("record 0 of the batch: normal"));
+        assert!(message(&batch(vec![0; 4097 * 128])).contains("at most 4096"));
         assert!(message(&v1::RecordBatch { level: 65, ..batch(vec![]) }).contains("level is 65"));
         assert!(
             message(&v1::RecordBatch { namespace: vec![1].into(), ..batch(vec![]) }).contains("namespace has 1 bytes")

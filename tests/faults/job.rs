@@ -79,6 +79,8 @@ pub fn record(id: RecordId, position: Vec3) -> Irradiance {
         irradiance: Vec3::splat((id.0 % 1000) as f32),
         gradient_t: [Vec2::ZERO; 3],
         gradient_r: [Vec2::ZERO; 3],
+        ellipse: [0.0; 3],
+        noise: 0.0,
     }
 }
 

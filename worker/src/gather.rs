@@ -72,6 +72,8 @@ impl Gather<'_> {
             irradiance: estimate.irradiance.max(Vec3::ZERO),
             gradient_t: estimate.gradient_t.map(own),
             gradient_r: estimate.gradient_r.map(own),
+            ellipse: [0.0; 3],
+            noise: 0.0,
         }
     }
 }

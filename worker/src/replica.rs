@@ -248,6 +248,8 @@ pub(crate) mod tests {
             irradiance: position + 1.0,
             gradient_t: [Vec2::ZERO; 3],
             gradient_r: [Vec2::ZERO; 3],
+            ellipse: [0.0; 3],
+            noise: 0.0,
         }
     }
 

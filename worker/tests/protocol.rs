@@ -31,6 +31,8 @@ fn entry(id: u128, step: u32) -> (Tag, Irradiance) {
         irradiance: Vec3::ONE,
         gradient_t: [Vec2::ZERO; 3],
         gradient_r: [Vec2::ZERO; 3],
+        ellipse: [0.0; 3],
+        noise: 0.0,
     };
     (Tag { level: 1, step }, record)
 }

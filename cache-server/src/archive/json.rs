@@ -45,6 +45,8 @@ struct RecordLine {
     irradiance: [f32; 3],
     gradient_t: [[f32; 2]; 3],
     gradient_r: [[f32; 2]; 3],
+    ellipse: [f32; 3],
+    noise: f32,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -205,6 +207,8 @@ fn record_line(namespace: &str, tag: Tag, r: &Irradiance) -> RecordLine {
         irradiance: r.irradiance.into(),
         gradient_t: r.gradient_t.map(Into::into),
         gradient_r: r.gradient_r.map(Into::into),
+        ellipse: r.ellipse,
+        noise: r.noise,
     }
 }
 
@@ -221,5 +225,7 @@ fn record(line: &RecordLine) -> Result<Irradiance, String> {
         irradiance: Vec3::from(line.irradiance),
         gradient_t: line.gradient_t.map(Vec2::from),
         gradient_r: line.gradient_r.map(Vec2::from),
+        ellipse: line.ellipse,
+        noise: line.noise,
     })
 }

@@ -26,6 +26,8 @@ fn record(id: u32, x: f32) -> Irradiance {
         irradiance: Vec3::new(1.0 / 3.0, 0.0, 5e9),
         gradient_t: [Vec2::new(0.1, -f32::MIN_POSITIVE); 3],
         gradient_r: [Vec2::new(1e20, 3.402_823e38); 3],
+        ellipse: [0.0; 3],
+        noise: 0.0,
     }
 }
 

@@ -16,7 +16,7 @@ use super::*;
 
 /// An entry of so many records, unlike that of any other number.
 fn entry(number: u64, records: usize) -> Entry {
-    let bytes: Vec<u8> = (0..records as u64 * 112).map(|i| (((i ^ number) * 0x9e37_79b9) >> 7) as u8).collect();
+    let bytes: Vec<u8> = (0..records as u64 * 128).map(|i| (((i ^ number) * 0x9e37_79b9) >> 7) as u8).collect();
     let namespace = vec![number as u8; 32].into();
     let batch = RecordBatch { namespace, kind: 1, level: 1, records: bytes.into(), step: number as u32 };
     Entry { entry: Some(entry::Entry::Batch(batch)) }

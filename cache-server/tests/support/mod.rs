@@ -89,6 +89,8 @@ pub fn record(id: u32) -> Irradiance {
         irradiance: Vec3::new(1.0 + x, 2.0, 3.0),
         gradient_t: [Vec2::new(0.1, 0.2); 3],
         gradient_r: [Vec2::new(0.3, -0.4); 3],
+        ellipse: [0.0; 3],
+        noise: 0.0,
     }
 }
 
