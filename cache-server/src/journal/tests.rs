@@ -292,7 +292,7 @@ fn large_appends_are_split_and_too_large_entries_refused() {
     assert_eq!(held(&mut disk), many);
     drop(disk);
     let report = open(directory.path()).1;
-    assert_eq!((report.appends, report.records), (4, 30 * 4096));
+    assert_eq!((report.appends, report.records), (5, 30 * 4096));
 }
 
 #[test]
