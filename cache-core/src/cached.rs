@@ -5,6 +5,7 @@
 
 use glam::Vec3;
 
+use crate::details::Weighting;
 use crate::id::RecordId;
 
 /// Where an answer is wanted: a point and its unit normal.
@@ -71,7 +72,7 @@ pub trait Cached: Clone + Send + Sync + 'static {
 
     /// Weight at a query for the clamped and bounded `radius` and the allowed error `a`; at most 0: does not count.
     /// Must be 0 or less wherever `query` is farther than `a * radius` from the site.
-    fn weight(&self, query: &Query, radius: f32, a: f32) -> f32;
+    fn weight(&self, query: &Query, radius: f32, a: f32, weighting: Weighting) -> f32;
     /// Adds this record's estimate at `query`, times `weight`, to `answer`. `limit` in [0, 1] scales gradients where
     /// the record counts farther than its R allows extrapolation.
     fn add(&self, query: &Query, weight: f32, limit: f32, answer: &mut Self::Answer);

@@ -8,11 +8,15 @@ use std::f32::consts::PI;
 
 use glam::{Vec2, Vec3};
 
+use crate::details::{Details, Distance, Gradients, Metric};
 use crate::math::{Rgb, sin_cos};
+use crate::mesh::{absolute, survey};
 
 /// What one gather ray brought back.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sample {
+    /// Where it went: unit, local, z along the normal.
+    pub direction: Vec3,
     /// Incoming radiance, W/(sr m²).
     pub radiance: Rgb,
     /// Distance to what it hit, world length; infinite for nothing.
@@ -28,8 +32,13 @@ pub struct Estimate {
     pub gradient_t: [Vec2; 3],
     /// ∇_r E, W/m² per radian, per channel: change when the normal turns about the local x and y.
     pub gradient_r: [Vec2; 3],
-    /// Harmonic mean of the distances, limited by |E| / |∇_t E| (Krivanek 2006 eq. 2); world length, may be infinite.
+    /// Harmonic mean of the distances, or the least of them, limited by |E| / |∇_t E| (Krivanek 2006 eq. 2); world length, may
+    /// be infinite.
     pub radius: f32,
+    /// (xx, xy, yy) of M, 1/m²: at a distance d the second derivatives change E by (dᵀ M d) E. 0 where they were not asked for.
+    pub ellipse: [f32; 3],
+    /// Standard error of E, root mean square over the channels, W/m².
+    pub noise: f32,
 }
 
 /// The cells of a hemisphere, with the constants each brings to the sums.
@@ -111,44 +120,120 @@ impl Strata {
     ///
     /// # Panics
     /// If there are not exactly [`Self::rays`] samples.
-    pub fn estimate(&self, samples: &[Sample]) -> Estimate {
+    pub fn estimate(&self, samples: &[Sample], details: &Details) -> Estimate {
         assert_eq!(samples.len(), self.rays());
-        let mut sum = Rgb::ZERO;
-        let mut inverse = 0.0f32;
-        // Per channel would need the transposed layout: keep x and y parts as colours instead.
-        let (mut tx, mut ty, mut rx, mut ry) = (Rgb::ZERO, Rgb::ZERO, Rgb::ZERO, Rgb::ZERO);
+        let rays = self.rays() as f32;
+        let irradiance = irradiance(samples);
+        let mesh = (details.metric == Metric::Hessian || details.gradients == Gradients::Mesh)
+            .then(|| survey(samples, self.polar, self.azimuthal));
+        let mut gradient_t = match (details.gradients, &mesh) {
+            (Gradients::None, _) => [Vec2::ZERO; 3],
+            (Gradients::Mesh, Some(mesh)) => mesh.gradient,
+            (Gradients::Samples, _) => self.by_samples(samples),
+            _ => self.by_borders(samples),
+        };
+        let mut gradient_r = if details.rotation { self.rotation(samples) } else { [Vec2::ZERO; 3] };
+        if !details.gradients_per_channel {
+            for gradients in [&mut gradient_t, &mut gradient_r] {
+                let relative = gradients.iter().sum::<Vec2>() / irradiance.element_sum().max(f32::MIN_POSITIVE);
+                *gradients = std::array::from_fn(|c| relative * irradiance[c]);
+            }
+        }
+        let distance = match details.distance {
+            Distance::Harmonic => rays / samples.iter().map(|s| 1.0 / s.distance).sum::<f32>(),
+            Distance::Nearest => samples.iter().map(|s| s.distance).fold(f32::INFINITY, f32::min),
+        };
+        let slope = gradient_t.iter().sum::<Vec2>().length();
+        let by_gradient =
+            if details.radius_by_gradient && slope > 0.0 { irradiance.element_sum() / slope } else { f32::INFINITY };
+        let mean = irradiance.element_sum() * (1.0 / 3.0);
+        let ellipse = match (details.metric, mesh) {
+            (Metric::Hessian, Some(mesh)) if mean > 0.0 => absolute(mesh.hessian).map(|h| h / (2.0 * mean)),
+            _ => [0.0; 3],
+        };
+        let noise = PI * self.variance(samples).sqrt() / rays.sqrt();
+        Estimate { irradiance, gradient_t, gradient_r, radius: distance.min(by_gradient), ellipse, noise }
+    }
+
+    /// ∇_t E by Ward, Heckbert 1992 eq. 2.
+    fn by_borders(&self, samples: &[Sample]) -> [Vec2; 3] {
+        let mut sum = [Vec2::ZERO; 3];
         let n = self.azimuthal;
         for (j, ring) in self.rings.iter().enumerate() {
             for (k, sector) in self.sectors.iter().enumerate() {
                 let here = &samples[j * n + k];
-                sum += here.radiance;
-                inverse += 1.0 / here.distance;
-                rx += here.radiance * (ring.tilt * sector.turn.x);
-                ry += here.radiance * (ring.tilt * sector.turn.y);
                 if j > 0 {
                     let inner = &samples[(j - 1) * n + k];
-                    let change = (here.radiance - inner.radiance) * (ring.border / here.distance.min(inner.distance));
-                    tx += change * sector.middle.x;
-                    ty += change * sector.middle.y;
+                    move_border(&mut sum, sector.middle * ring.border, here, inner);
                 }
-                let beside = &samples[j * n + (k + n - 1) % n];
-                let change = (here.radiance - beside.radiance) * (ring.side / here.distance.min(beside.distance));
-                tx += change * sector.border.x;
-                ty += change * sector.border.y;
+                move_border(&mut sum, sector.border * ring.side, here, &samples[j * n + (k + n - 1) % n]);
             }
         }
-        let rays = self.rays() as f32;
-        let irradiance = sum * (PI / rays);
-        let mean = |c: Rgb| c.element_sum();
-        let slope = Vec2::new(mean(tx), mean(ty)).length();
-        let by_gradient = if slope > 0.0 { mean(irradiance) / slope } else { f32::INFINITY };
-        Estimate {
-            irradiance,
-            gradient_t: std::array::from_fn(|c| Vec2::new(tx[c], ty[c])),
-            gradient_r: std::array::from_fn(|c| Vec2::new(rx[c], ry[c])),
-            radius: (rays / inverse).min(by_gradient),
-        }
+        sum
     }
+
+    /// ∇_t E by Krivanek et al. 2005b, section 3, "irradiance gradient".
+    fn by_samples(&self, samples: &[Sample]) -> [Vec2; 3] {
+        let mut sum = [Vec2::ZERO; 3];
+        let n = self.azimuthal;
+        for (j, ring) in self.rings.iter().enumerate() {
+            let cosine = |j: usize| (1.0 - j as f32 / self.polar as f32).sqrt();
+            for (k, sector) in self.sectors.iter().enumerate() {
+                let here = &samples[j * n + k];
+                let cos = here.direction.z;
+                let sin = (1.0 - cos * cos).max(0.0).sqrt().max(1e-3);
+                if j > 0 {
+                    let inner = &samples[(j - 1) * n + k];
+                    // sin θ_j- cos θ_j-, times the sample's own cosine.
+                    let speed = ring.border / cosine(j) * cos;
+                    move_border(&mut sum, sector.middle * speed, here, inner);
+                }
+                let speed = cos * (cosine(j) - cosine(j + 1)) / sin;
+                move_border(&mut sum, sector.border * speed, here, &samples[j * n + (k + n - 1) % n]);
+            }
+        }
+        sum
+    }
+
+    /// ∇_r E by Ward, Heckbert 1992 eq. 3, its sign as finite differences demand.
+    fn rotation(&self, samples: &[Sample]) -> [Vec2; 3] {
+        let mut sum = [Vec2::ZERO; 3];
+        for (ring, row) in self.rings.iter().zip(samples.chunks_exact(self.azimuthal)) {
+            for (sector, sample) in self.sectors.iter().zip(row) {
+                let turn = sector.turn * ring.tilt;
+                (0..3).for_each(|c| sum[c] += turn * sample.radiance[c]);
+            }
+        }
+        sum
+    }
+
+    /// Variance of one sample about what its cell sees, mean of the channels, (W/(sr m²))².
+    ///
+    /// By second differences round each ring: what changes evenly from cell to cell is no noise. (The standard deviation of
+    /// every second ray, Krivanek 2006, sees even changes as noise too.)
+    fn variance(&self, samples: &[Sample]) -> f32 {
+        let n = self.azimuthal;
+        let bend = |row: &[Sample], k: usize| {
+            let [before, here, after] = [(k + n - 1) % n, k, (k + 1) % n].map(|k| row[k].radiance);
+            (before - here * 2.0 + after).length_squared()
+        };
+        let rows = samples.chunks_exact(n);
+        let sum: f32 = rows.map(|row| (0..n).map(|k| bend(row, k)).sum::<f32>()).sum();
+        // A second difference of independent samples varies six times as much as one of them.
+        sum / (6.0 * 3.0 * samples.len() as f32)
+    }
+}
+
+/// E of the samples of all cells, W/m².
+pub fn irradiance(samples: &[Sample]) -> Rgb {
+    samples.iter().map(|s| s.radiance).sum::<Rgb>() * (PI / samples.len() as f32)
+}
+
+/// The border between two cells moves, as fast as the nearer of both demands.
+#[inline]
+fn move_border(sum: &mut [Vec2; 3], speed: Vec2, here: &Sample, beside: &Sample) {
+    let change = (here.radiance - beside.radiance) / here.distance.min(beside.distance);
+    (0..3).for_each(|c| sum[c] += speed * change[c]);
 }
 
 #[cfg(test)]
@@ -158,15 +243,20 @@ mod tests {
 
     /// Gathers at `position` with unit normal `normal` in a world given by direction -> (radiance, distance).
     fn gather(rays: u32, world: impl Fn(Vec3) -> (f32, f32)) -> Estimate {
+        gather_by(&Details::default(), rays, world)
+    }
+
+    fn gather_by(details: &Details, rays: u32, world: impl Fn(Vec3) -> (f32, f32)) -> Estimate {
         let strata = Strata::new(rays);
         let mut random = Random::named("test", &[1]);
         let samples: Vec<_> = (0..strata.rays())
             .map(|i| {
-                let (radiance, distance) = world(strata.direction(i, Vec2::new(random.uniform(), random.uniform())));
-                Sample { radiance: Rgb::splat(radiance), distance }
+                let direction = strata.direction(i, Vec2::new(random.uniform(), random.uniform()));
+                let (radiance, distance) = world(direction);
+                Sample { direction, radiance: Rgb::splat(radiance), distance }
             })
             .collect();
-        strata.estimate(&samples)
+        strata.estimate(&samples, details)
     }
 
     /// Radiance and distance seen from a point inside a unit sphere whose half x > 0 is bright.
@@ -192,35 +282,93 @@ mod tests {
         assert!(e.gradient_r[0].x.abs() < 0.01);
     }
 
+    const GRADIENTS: [Gradients; 3] = [Gradients::Borders, Gradients::Samples, Gradients::Mesh];
+
     #[test]
     fn half_lit_sphere_value_and_both_gradients() {
-        let e = gather(40_000, |d| half_lit_sphere(Vec3::ZERO, d));
-        assert!((e.irradiance.x - PI / 2.0).abs() < 5e-3);
-        // Turning about y brings in the bright half: E = π/2 (1 + sin α), dE/dα = π/2.
-        assert!((e.gradient_r[0].y - PI / 2.0).abs() < 0.02, "{:?}", e.gradient_r[0]);
-        // Moving along x: the boundary great circle, seen from the centre at distance 1, sweeps 2 per unit length
-        // (∫ cos θ dθ over it); finite differences agree.
-        let step = 0.05;
-        let shifted = |x: f32| gather(40_000, |d| half_lit_sphere(Vec3::X * x, d)).irradiance.x;
-        let difference = (shifted(step) - shifted(-step)) / (2.0 * step);
-        assert!((e.gradient_t[0].x - difference).abs() < 0.05 * difference, "{:?} {difference}", e.gradient_t[0]);
-        assert!((e.gradient_t[0].x - 2.0).abs() < 0.05, "{:?}", e.gradient_t[0]);
-        assert!(e.gradient_t[0].y.abs() < 0.05);
+        for gradients in GRADIENTS {
+            let details = Details { gradients, ..Details::default() };
+            let gather = |from: Vec3| gather_by(&details, 40_000, |d| half_lit_sphere(from, d));
+            let e = gather(Vec3::ZERO);
+            assert!((e.irradiance.x - PI / 2.0).abs() < 5e-3);
+            // Turning about y brings in the bright half: E = π/2 (1 + sin α), dE/dα = π/2.
+            assert!((e.gradient_r[0].y - PI / 2.0).abs() < 0.02, "{:?}", e.gradient_r[0]);
+            // Moving along x: the boundary great circle, seen from the centre at distance 1, sweeps 2 per unit length
+            // (∫ cos θ dθ over it); finite differences agree.
+            let step = 0.05;
+            let shifted = |x: f32| gather(Vec3::X * x).irradiance.x;
+            let difference = (shifted(step) - shifted(-step)) / (2.0 * step);
+            let gradient = e.gradient_t[0];
+            assert!((gradient.x - difference).abs() < 0.05 * difference, "{gradients:?} {gradient:?} {difference}");
+            assert!((gradient.x - 2.0).abs() < 0.05, "{gradients:?} {gradient:?}");
+            assert!(gradient.y.abs() < 0.05, "{gradients:?} {gradient:?}");
+        }
     }
 
-    /// Below a bright square lamp, off its middle: finite differences of the exact integral.
+    /// A square lamp above, off the middle, before a far dark wall.
+    fn lamp(from: Vec3, d: Vec3) -> (f32, f32) {
+        let at = from + d * (1.0 / d.z.max(1e-6));
+        let on = (at.x - 0.8).abs() < 0.4 && (at.y + 0.3).abs() < 0.5 && d.z > 1e-6;
+        (f32::from(on), if on { 1.0 / d.z } else { 50.0 })
+    }
+
+    /// Below a lamp: finite differences of the exact integral.
     #[test]
     fn the_translational_gradient_agrees_with_finite_differences_under_a_lamp() {
-        let lamp = |from: Vec3, d: Vec3| {
-            let at = from + d * (1.0 / d.z.max(1e-6));
-            let on = (at.x - 0.8).abs() < 0.4 && (at.y + 0.3).abs() < 0.5 && d.z > 1e-6;
-            (f32::from(on), if on { 1.0 / d.z } else { 50.0 })
-        };
+        for gradients in GRADIENTS {
+            let details = Details { gradients, ..Details::default() };
+            let gather = |from: Vec3| gather_by(&details, 90_000, |d| lamp(from, d));
+            let e = gather(Vec3::ZERO);
+            for (axis, estimate) in [(Vec3::X, e.gradient_t[0].x), (Vec3::Y, e.gradient_t[0].y)] {
+                let shifted = |s: f32| gather(axis * s).irradiance.x;
+                let difference = (shifted(0.05) - shifted(-0.05)) / 0.1;
+                assert!(
+                    (estimate - difference).abs() < 0.06 * difference.abs(),
+                    "{gradients:?} {estimate} {difference}"
+                );
+            }
+        }
+    }
+
+    /// The same for the second derivatives, which the ellipse holds as |H| / 2E.
+    #[test]
+    fn the_ellipse_agrees_with_finite_differences_under_a_lamp() {
         let e = gather(90_000, |d| lamp(Vec3::ZERO, d));
-        for (axis, estimate) in [(Vec3::X, e.gradient_t[0].x), (Vec3::Y, e.gradient_t[0].y)] {
-            let shifted = |s: f32| gather(90_000, |d| lamp(axis * s, d)).irradiance.x;
-            let difference = (shifted(0.05) - shifted(-0.05)) / 0.1;
-            assert!((estimate - difference).abs() < 0.06 * difference.abs(), "{estimate} {difference}");
+        let at = |x: f32, y: f32| f64::from(gather(90_000, |d| lamp(Vec3::new(x, y, 0.0), d)).irradiance.x);
+        let h = 0.2;
+        let second = |x: f32, y: f32| (at(x, y) - 2.0 * at(0.0, 0.0) + at(-x, -y)) / f64::from(h * h);
+        let mixed = (at(h, h) - at(h, -h) - at(-h, h) + at(-h, -h)) / f64::from(4.0 * h * h);
+        let exact = absolute([second(h, 0.0) as f32, mixed as f32, second(0.0, h) as f32]);
+        let size = exact[0].max(exact[2]);
+        for (estimate, exact) in e.ellipse.into_iter().zip(exact) {
+            let estimate = estimate * 2.0 * e.irradiance.x;
+            assert!((estimate - exact).abs() < 0.1 * size, "{:?} {exact:?}", e.ellipse);
+        }
+    }
+
+    /// What many gathers scatter by, under a lamp and with samples that are noisy themselves.
+    #[test]
+    fn the_noise_told_is_the_noise_met() {
+        for rays in [64, 500] {
+            let strata = Strata::new(rays);
+            let estimates: Vec<_> = (0..400u64)
+                .map(|seed| {
+                    let mut random = Random::named("noise", &[seed]);
+                    let samples: Vec<_> = (0..strata.rays())
+                        .map(|i| {
+                            let direction = strata.direction(i, Vec2::new(random.uniform(), random.uniform()));
+                            let (light, distance) = lamp(Vec3::ZERO, direction);
+                            let radiance = Rgb::splat(light + random.uniform() * (1.0 + direction.x));
+                            Sample { direction, radiance, distance }
+                        })
+                        .collect();
+                    strata.estimate(&samples, &Details::default())
+                })
+                .collect();
+            let mean = estimates.iter().map(|e| e.irradiance.x).sum::<f32>() / 400.0;
+            let met = (estimates.iter().map(|e| (e.irradiance.x - mean).powi(2)).sum::<f32>() / 399.0).sqrt();
+            let told = (estimates.iter().map(|e| e.noise * e.noise).sum::<f32>() / 400.0).sqrt();
+            assert!((told / met - 1.0).abs() < 0.25, "{rays} rays: told {told}, met {met}");
         }
     }
 }

@@ -12,6 +12,7 @@
 use glam::{Vec2, Vec3};
 
 use crate::cached::{Cached, Invalid, Query};
+use crate::details::Weighting;
 use crate::id::RecordId;
 use crate::math::{Frame, Rgb};
 
@@ -79,14 +80,22 @@ impl Cached for Irradiance {
         (self.radius_min, self.radius_max)
     }
 
-    /// Ward 1988 eq. 5, lowered by 1/a so that it reaches 0 at the border (course slides, "weighting function revisited").
-    /// A record in front of the query (Ward 1988 eq. 6) does not count; the test's tolerance scales with R.
+    /// The error e is that of Ward 1988 eq. 5, or the ellipse's where that says more. A record in front of the query (Ward
+    /// 1988 eq. 6) does not count; the test's tolerance scales with R.
     #[inline]
-    fn weight(&self, query: &Query, radius: f32, a: f32) -> f32 {
+    fn weight(&self, query: &Query, radius: f32, a: f32, weighting: Weighting) -> f32 {
         let offset = query.position - self.position;
-        let translation = offset.length() / radius;
+        let mut translation = offset.length() / radius;
         // sqrt(1 - n·n_i) without its cancellation: |n - n_i|² = 2 (1 - n·n_i) for unit vectors.
         let rotation = (query.normal - self.normal).length() * std::f32::consts::FRAC_1_SQRT_2;
+        if translation + rotation >= a {
+            return 0.0;
+        }
+        let [xx, xy, yy] = self.ellipse;
+        if xx + yy > 0.0 {
+            let Vec2 { x, y } = Frame::around(self.normal).tangential(offset);
+            translation = translation.max((x * x * xx + 2.0 * x * y * xy + y * y * yy).max(0.0).sqrt());
+        }
         let error = translation + rotation;
         if error >= a {
             return 0.0;
@@ -95,7 +104,11 @@ impl Cached for Irradiance {
         if behind < -IN_FRONT_TOLERANCE * radius {
             return 0.0;
         }
-        1.0 / error.max(ERROR_MIN) - 1.0 / a
+        match weighting {
+            Weighting::Inverse => 1.0 / error.max(ERROR_MIN),
+            Weighting::Linear => 1.0 - error / a,
+            Weighting::InverseToZero => 1.0 / error.max(ERROR_MIN) - 1.0 / a,
+        }
     }
 
     /// Ward 1992 eq. 6: E_i + (n_i × n)·∇_r E_i + (p - p_i)·∇_t E_i, never below 0.
@@ -320,13 +333,27 @@ mod tests {
     fn weight_falls_to_zero_at_the_border_and_excludes_what_lies_behind() {
         let r = sound();
         let at = |offset: Vec3| Query { position: r.position + offset, normal: r.normal };
-        assert!(r.weight(&at(Vec3::X * 0.5), 2.0, 0.3) > 0.0);
-        assert!(r.weight(&at(Vec3::X * 0.599), 2.0, 0.3) < 0.01);
-        assert_eq!(r.weight(&at(Vec3::X * 0.601), 2.0, 0.3), 0.0);
+        let weight = |query: &Query| r.weight(query, 2.0, 0.3, Weighting::InverseToZero);
+        assert!(weight(&at(Vec3::X * 0.5)) > 0.0);
+        assert!(weight(&at(Vec3::X * 0.599)) < 0.01);
+        assert_eq!(weight(&at(Vec3::X * 0.601)), 0.0);
         // A query below the record would see what the record does not.
-        assert_eq!(r.weight(&at(Vec3::new(0.1, -0.1, 0.0)), 2.0, 0.3), 0.0);
-        assert!(r.weight(&at(Vec3::new(0.1, 0.1, 0.0)), 2.0, 0.3) > 0.0);
+        assert_eq!(weight(&at(Vec3::new(0.1, -0.1, 0.0))), 0.0);
+        assert!(weight(&at(Vec3::new(0.1, 0.1, 0.0))) > 0.0);
         // On the site itself the weight is finite.
-        assert!(r.weight(&at(Vec3::ZERO), 2.0, 0.3).is_finite());
+        assert!(weight(&at(Vec3::ZERO)).is_finite());
+    }
+
+    #[test]
+    fn the_ellipse_bounds_what_r_allows() {
+        let frame = Frame::around(sound().normal);
+        // Semi-axes 1 and 4: at a = 0.3, 0.3 along x and, but for R = 2, 1.2 along y.
+        let r = Irradiance { ellipse: [1.0, 0.0, 1.0 / 16.0], ..sound() };
+        let reaches = |offset: Vec3| {
+            let query = Query { position: r.position + offset, normal: r.normal };
+            r.weight(&query, 2.0, 0.3, Weighting::Linear) > 0.0
+        };
+        assert!(reaches(frame.x * 0.29) && !reaches(frame.x * 0.31));
+        assert!(reaches(frame.y * 0.59) && !reaches(frame.y * 0.61));
     }
 }

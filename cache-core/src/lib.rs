@@ -22,7 +22,9 @@ pub mod cached;
 pub mod irradiance;
 pub mod null;
 
+pub mod details;
 pub mod hemisphere;
+pub mod mesh;
 
 pub mod clamp;
 pub mod octree;

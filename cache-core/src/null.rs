@@ -4,6 +4,7 @@
 use glam::Vec3;
 
 use crate::cached::{Cached, Invalid, Query};
+use crate::details::Weighting;
 use crate::id::RecordId;
 
 /// A record without content.
@@ -39,7 +40,7 @@ impl Cached for Null {
         (1e-18, 1e18)
     }
 
-    fn weight(&self, query: &Query, radius: f32, a: f32) -> f32 {
+    fn weight(&self, query: &Query, radius: f32, a: f32, _weighting: Weighting) -> f32 {
         a * radius - query.position.distance(self.position)
     }
 

@@ -7,6 +7,7 @@ use smallvec::SmallVec;
 
 use crate::cached::{Cached, Query};
 use crate::clamp::Clamp;
+use crate::details::Details;
 use crate::id::{Digest, RecordId};
 use crate::octree::Octree;
 
@@ -14,6 +15,7 @@ use crate::octree::Octree;
 #[derive(Clone, Debug)]
 pub struct Sealed<C> {
     a: f32,
+    details: Details,
     records: Vec<C>,
     derived: Vec<Derived>,
     octree: Octree,
@@ -32,17 +34,24 @@ struct Derived {
 }
 
 impl Derived {
-    fn new<C: Cached>(record: &C, clamped: f32) -> Self {
+    fn new<C: Cached>(record: &C, clamped: f32, details: &Details) -> Self {
         let (min, max) = record.radius_bounds();
         let radius = clamped.min(max).max(min);
-        Self { clamped, radius, limit: (clamped / radius).min(1.0) }
+        let limit = if details.gradient_by_radius { (clamped / radius).min(1.0) } else { 1.0 };
+        Self { clamped, radius, limit }
     }
 }
 
 impl<C: Cached> Sealed<C> {
     /// An empty set whose records will count with the allowed error `a` (greater than 0).
     pub fn new(a: f32) -> Self {
-        Self { a, records: Vec::new(), derived: Vec::new(), octree: Octree::default(), digest: Digest::default() }
+        Self::with(a, Details::default())
+    }
+
+    /// The same with other details than the usual ones.
+    pub fn with(a: f32, details: Details) -> Self {
+        let (records, derived, octree) = (Vec::new(), Vec::new(), Octree::default());
+        Self { a, details, records, derived, octree, digest: Digest::default() }
     }
 
     /// Opens the set, adds records that are not in it yet, and seals it again. The result depends on the united set
@@ -53,20 +62,23 @@ impl<C: Cached> Sealed<C> {
         if self.records.len() == known {
             return;
         }
-        let site = |r: &C| (r.position(), r.radius());
-        let all = Clamp::new(self.records.iter().map(site).collect());
-        let fresh = Clamp::new(self.records[known..].iter().map(site).collect());
+        let clamps = |records: &[C]| {
+            let records = if self.details.neighbor_clamping { records } else { &[] };
+            Clamp::new(records.iter().map(|r| (r.position(), r.radius())).collect())
+        };
+        let (all, fresh) = (clamps(&self.records), clamps(&self.records[known..]));
         for (record, derived) in self.records.iter().zip(&mut self.derived) {
             let clamped = fresh.clamp(record.position(), derived.clamped);
             if clamped < derived.clamped {
-                *derived = Derived::new(record, clamped);
+                *derived = Derived::new(record, clamped, &self.details);
             }
         }
         for (i, record) in self.records.iter().enumerate().skip(known) {
             let (min, max) = record.radius_bounds();
             // Filed by the greatest reach the record can ever have, so that clamping never moves it.
             self.octree.insert(i as u32, record.position(), self.a * record.radius().min(max).max(min));
-            self.derived.push(Derived::new(record, all.clamp(record.position(), record.radius())));
+            let clamped = all.clamp(record.position(), record.radius());
+            self.derived.push(Derived::new(record, clamped, &self.details));
             self.digest.add(record.id());
         }
     }
@@ -75,7 +87,9 @@ impl<C: Cached> Sealed<C> {
     pub fn covers(&self, query: &Query) -> bool {
         let mut found = false;
         self.octree.visit(query.position, |i| {
-            found = self.records[i as usize].weight(query, self.derived[i as usize].radius, self.a) > 0.0;
+            found =
+                self.records[i as usize].weight(query, self.derived[i as usize].radius, self.a, self.details.weighting)
+                    > 0.0;
             !found
         });
         found
@@ -86,7 +100,7 @@ impl<C: Cached> Sealed<C> {
         let mut near: SmallVec<[(RecordId, u32, f32); 32]> = SmallVec::new();
         self.octree.visit(query.position, |i| {
             let record = &self.records[i as usize];
-            let weight = record.weight(query, self.derived[i as usize].radius, self.a);
+            let weight = record.weight(query, self.derived[i as usize].radius, self.a, self.details.weighting);
             if weight > 0.0 {
                 near.push((record.id(), i, weight));
             }

@@ -3,6 +3,7 @@
 use std::ops::Range;
 use std::sync::Arc;
 
+use cache_core::details::Spacing;
 use cache_core::hemisphere::Strata;
 use cache_core::id::Random;
 use cache_core::{Irradiance, Namespace, Query, RecordId, Sealed, rounds};
@@ -28,6 +29,9 @@ const REACH_MIN_HEIGHT: [f32; 2] = [1.0 / 128.0, 1.0 / 40.0];
 
 /// The same in pixels, for small pictures (course slides: 1.5 to 3).
 const REACH_MIN_PIXELS: [f32; 2] = [1.5, 4.0];
+
+/// The same as a fraction of the scene's radius.
+const REACH_MIN_WORLD: [f32; 2] = [1.0 / 150.0, 1.0 / 50.0];
 
 /// Greatest over least reach (course slides: Tabellion and Lamorlette 2004 about 7). 32 makes hardly fewer records and
 /// nearly doubles the worst block of the stairs.
@@ -153,6 +157,7 @@ impl Frame {
             seed: self.settings.seed,
             level,
             strata: &self.strata[usize::from(level > 1)],
+            details: &self.settings.details,
         };
         let id = gather.id(&site);
         if let Some(record) = known(id) {
@@ -186,10 +191,18 @@ impl Frame {
             if depth == level {
                 let deeper = usize::from(level > 1);
                 let pixels = (REACH_MIN_HEIGHT[deeper] * s.height as f32).max(REACH_MIN_PIXELS[deeper]);
-                let reach = pixels * s.pixel_size(way);
+                let reach = match s.details.spacing {
+                    Spacing::Pixels => pixels * s.pixel_size(way),
+                    Spacing::World => REACH_MIN_WORLD[deeper] * self.world.radius,
+                    Spacing::Free => f32::MIN_POSITIVE,
+                };
                 // From far away, or with a tiny `a`, everything is nearer than that.
                 let radius_min = (reach / s.a).clamp(f32::MIN_POSITIVE, 4.0 * self.world.radius);
-                let radius_bounds = (radius_min, radius_min * REACH_RATIO);
+                let radius_max = match s.details.spacing {
+                    Spacing::Pixels => radius_min * REACH_RATIO,
+                    Spacing::World | Spacing::Free => 4.0 * self.world.radius,
+                };
+                let radius_bounds = (radius_min, radius_max.max(radius_min));
                 return (bsdf.diffuse() != Rgb::ZERO).then_some(Site { at, radius_bounds });
             }
             let [a, b, c, _] = sampler.next4();

@@ -1,6 +1,7 @@
 //! A record of irradiance is made: stratified rays from a site, each bringing back what it sees where it lands.
 
-use cache_core::hemisphere::Strata;
+use cache_core::details::Details;
+use cache_core::hemisphere::{Estimate, Strata};
 use cache_core::id::{Origin, Random};
 use cache_core::math::Frame;
 use cache_core::{Cached, Irradiance, Namespace, RecordId};
@@ -10,6 +11,9 @@ use crate::frame::Counts;
 use crate::sampler::Sampler;
 use crate::trace::Tracer;
 use crate::world::Meeting;
+
+/// Greatest ratio of an ellipse's semi-axes.
+const ELONGATION: f32 = 2.0;
 
 /// Where a record is wanted.
 pub struct Site {
@@ -31,6 +35,8 @@ pub struct Gather<'a> {
     pub level: u32,
     /// Cells of the hemisphere.
     pub strata: &'a Strata,
+    /// What its samples become.
+    pub details: &'a Details,
 }
 
 impl Gather<'_> {
@@ -59,7 +65,7 @@ impl Gather<'_> {
         let frame = turned(site.at.frame, random.uniform());
         let mut sampler = Sampler::Stream(random);
         let samples = self.tracer.hemisphere(&site.at, frame, self.level, self.strata, &mut sampler, counts);
-        let estimate = self.strata.estimate(&samples);
+        let estimate = self.strata.estimate(&samples, self.details);
         let own = |v: Vec2| site.at.frame.tangential(frame.x * v.x + frame.y * v.y);
         Irradiance {
             id,
@@ -72,10 +78,42 @@ impl Gather<'_> {
             irradiance: estimate.irradiance.max(Vec3::ZERO),
             gradient_t: estimate.gradient_t.map(own),
             gradient_r: estimate.gradient_r.map(own),
-            ellipse: [0.0; 3],
-            noise: 0.0,
+            ellipse: self.ellipse(site, frame, &estimate),
+            noise: estimate.noise,
         }
     }
+}
+
+impl Gather<'_> {
+    /// The estimate's ellipse along the site's tangents, no axis shorter than the least R.
+    fn ellipse(&self, site: &Site, frame: Frame, estimate: &Estimate) -> [f32; 3] {
+        let [xx, xy, yy] = estimate.ellipse;
+        if xx + yy == 0.0 || !(xx + yy).is_finite() {
+            return [0.0; 3];
+        }
+        // Both tangents of the gather in those of the site: a turn.
+        let Vec2 { x: c, y: s } = site.at.frame.tangential(frame.x);
+        let turned = [
+            xx * c * c - 2.0 * xy * s * c + yy * s * s,
+            (xx - yy) * s * c + xy * (c * c - s * s),
+            xx * s * s + 2.0 * xy * s * c + yy * c * c,
+        ];
+        limited(turned, site.radius_bounds.0)
+    }
+}
+
+/// The ellipse with no semi-axis shorter than `least`, and none longer than [`ELONGATION`] times the other.
+fn limited([xx, xy, yy]: [f32; 3], least: f32) -> [f32; 3] {
+    let most = (least * least).recip();
+    let (middle, half) = ((xx + yy) * 0.5, (xx - yy) * 0.5);
+    let spread = (half * half + xy * xy).sqrt();
+    // Eigenvalues: squared reciprocals of the minor and the major semi-axis.
+    let (minor, major) = (middle + spread, middle - spread);
+    let bounded = minor.min(most);
+    let bounds = (bounded, major.max(bounded / (ELONGATION * ELONGATION)).min(bounded));
+    let (middle, scale) =
+        ((bounds.0 + bounds.1) * 0.5, if spread > 0.0 { (bounds.0 - bounds.1) * 0.5 / spread } else { 0.0 });
+    [middle + half * scale, xy * scale, middle - half * scale]
 }
 
 /// The frame turned about its normal by a fraction of a full turn.

@@ -1,6 +1,7 @@
 //! What a picture depends on besides the scene: the settings users choose, and the namespace they lead to.
 
 use cache_core::Namespace;
+use cache_core::details::Details;
 use glam::Vec3;
 
 use crate::scene::Camera;
@@ -70,6 +71,8 @@ pub struct Settings {
     pub bounces: u32,
     /// Turns to another, equally good, set of random numbers.
     pub seed: u64,
+    /// Practical details; only the usual ones travel over the wire.
+    pub details: Details,
 }
 
 /// Edge of a tile in pixels.
@@ -88,6 +91,7 @@ impl Settings {
             rays: defaults::RAYS,
             bounces: ALL_BOUNCES,
             seed: defaults::SEED,
+            details: Details::default(),
         }
     }
 

@@ -20,8 +20,8 @@ pub enum Order {
 
 /// Fills every level of a frame.
 pub fn fill(frame: &Frame, order: Order) -> Levels {
-    let a = frame.settings().a;
-    let mut levels: Levels = (0..frame.levels()).map(|_| Arc::new(Sealed::new(a))).collect();
+    let (a, details) = (frame.settings().a, frame.settings().details);
+    let mut levels: Levels = (0..frame.levels()).map(|_| Arc::new(Sealed::with(a, details))).collect();
     let mut plan = Plan::new(frame.levels());
     let mut gathered = 0;
     while let Some(Step::Fill { level, pass, ranks }) = plan.next(gathered) {

@@ -1,6 +1,7 @@
 //! What a frame's specification says on the wire, from and to [`Settings`].
 
 use cache_core::Namespace;
+use cache_core::details::Details;
 use cache_proto::v1;
 use glam::Vec3;
 
@@ -67,6 +68,7 @@ pub fn settings(spec: &v1::FrameSpec) -> Result<Settings, String> {
         rays: spec.rays,
         bounces: spec.bounces,
         seed: spec.seed,
+        details: Details::default(),
     };
     check(&settings)?;
     if spec.tile_size != TILE {
@@ -115,6 +117,7 @@ pub(crate) mod tests {
             rays: 64,
             bounces: ALL_BOUNCES,
             seed: u64::MAX,
+            details: Details::default(),
         }
     }
 

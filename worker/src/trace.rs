@@ -9,7 +9,7 @@
 use std::f32::consts::FRAC_1_PI;
 
 use cache_core::Query;
-use cache_core::hemisphere::{Sample, Strata};
+use cache_core::hemisphere::{Sample, Strata, irradiance};
 use cache_core::irradiance::Answer;
 use glam::{Vec2, Vec3};
 
@@ -168,7 +168,7 @@ impl Tracer<'_> {
             // Only what the camera sees is worth a gather of its own: its rays follow paths.
             let tracer = Tracer { regather: None, ..*self };
             let samples = tracer.hemisphere(at, at.frame, depth, strata, &mut sampler.branch(), counts);
-            Answer { irradiance: strata.estimate(&samples).irradiance, records: 0 }
+            Answer { irradiance: irradiance(&samples), records: 0 }
         })
     }
 
@@ -184,14 +184,15 @@ impl Tracer<'_> {
     ) -> Vec<Sample> {
         let mut ray = |cell| {
             let [u, v, ..] = sampler.next4();
-            let direction = frame.to_world(strata.direction(cell, Vec2::new(u, v))).normalize();
+            let local = strata.direction(cell, Vec2::new(u, v));
+            let direction = frame.to_world(local).normalize();
             if direction.dot(at.facet) <= 0.0 {
                 // Below the facet of a smooth surface: the surface hides itself, at no distance worth counting.
-                return Sample { radiance: Rgb::ZERO, distance: f32::INFINITY };
+                return Sample { direction: local, radiance: Rgb::ZERO, distance: f32::INFINITY };
             }
             let seen = self.see((at.leave(direction), direction), depth + 1, Chance::Gathered, sampler, counts);
             // Nothing is so near that its inverse overflows.
-            Sample { radiance: seen.total(), distance: seen.distance.max(1e-30) }
+            Sample { direction: local, radiance: seen.total(), distance: seen.distance.max(1e-30) }
         };
         (0..strata.rays()).map(&mut ray).collect()
     }
