@@ -2,6 +2,7 @@
 //!
 //! - [`judge`]: scenes with references, and the measure pictures of them are held to; the tests use it too.
 //! - [`pictures`]: speed against accuracy.
+//! - [`asked`]: whether a picture is as far from the truth as was asked for.
 //! - [`details`]: what each practical detail of irradiance caching buys.
 //! - [`records`]: records made up, of real size.
 //! - [`bare`]: the cache service with nothing behind it.
@@ -11,6 +12,7 @@
 //! - [`farm`]: one frame by farms of many sizes.
 //! - [`report`]: tables and charts.
 
+pub mod asked;
 pub mod details;
 pub mod judge;
 pub mod pictures;

@@ -41,6 +41,22 @@ pub struct Estimate {
     pub noise: f32,
 }
 
+impl Estimate {
+    /// What two independent gathers at one site say together; `rays` is how many each of them traced. How far the record
+    /// reaches is for this one to say, which should be the larger.
+    pub fn united(self, rays: f32, other: &Self, others: f32) -> Self {
+        let (own, theirs) = (rays / (rays + others), others / (rays + others));
+        let both = |a: [Vec2; 3], b: [Vec2; 3]| std::array::from_fn(|c| a[c] * own + b[c] * theirs);
+        Self {
+            irradiance: self.irradiance * own + other.irradiance * theirs,
+            gradient_t: both(self.gradient_t, other.gradient_t),
+            gradient_r: both(self.gradient_r, other.gradient_r),
+            noise: ((self.noise * own).powi(2) + (other.noise * theirs).powi(2)).sqrt(),
+            ..self
+        }
+    }
+}
+
 /// The cells of a hemisphere, with the constants each brings to the sums.
 #[derive(Clone, Debug)]
 pub struct Strata {

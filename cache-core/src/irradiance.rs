@@ -51,6 +51,8 @@ pub struct Answer {
     pub irradiance: Rgb,
     /// How many records answered.
     pub records: u32,
+    /// Standard error of the irradiance for the records' noise, root mean square over the channels, W/m².
+    pub noise: f32,
 }
 
 /// Wire and memory order of the float fields after the id.
@@ -121,10 +123,12 @@ impl Cached for Irradiance {
         let estimate = self.irradiance + Vec3::new(change(0), change(1), change(2));
         answer.irradiance += estimate.max(Vec3::ZERO) * weight;
         answer.records += 1;
+        answer.noise += (self.noise * weight).powi(2);
     }
 
     fn finish(answer: &mut Answer, weights: f32) {
         answer.irradiance /= weights;
+        answer.noise = answer.noise.sqrt() / weights;
     }
 
     fn encode(&self, bytes: &mut Vec<u8>) {

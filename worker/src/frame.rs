@@ -9,12 +9,13 @@ use cache_core::id::Random;
 use cache_core::{Irradiance, Namespace, Query, RecordId, Sealed, rounds};
 
 use crate::bsdf::Part;
-use crate::gather::{Gather, Site};
+use crate::gather::{Gather, Rays, Site};
 use crate::lights::Lights;
+use crate::pixel::{Pixel, deviations};
 use crate::sampler::Sampler;
 use crate::scene::{Rgb, Scene};
 use crate::settings::{Method, Settings};
-use crate::trace::{Chance, Tracer};
+use crate::trace::Tracer;
 use crate::world::World;
 
 /// Floats a pixel in a finished tile: beauty, direct, indirect, irradiance (RGB each), and how many records answered.
@@ -40,6 +41,15 @@ const REACH_RATIO: f32 = 8.0;
 /// Rays of a deeper level's gather, as a fraction: its error is averaged over many rays of the level above.
 const DEEPER_RAYS: f32 = 0.5;
 
+/// The same for gathers that trace as many rays as light varies.
+const DEEPER_EFFORT: f32 = 0.25;
+
+/// Rays by which such a gather finds out how much light varies.
+const FIRST_RAYS: u32 = 32;
+
+/// Samples by which a pixel finds out.
+const FIRST_SAMPLES: u32 = 8;
+
 /// Rays gathered for a sample of a pixel that no record covers, as a fraction: its pixel's other samples share the error.
 const MISSED_RAYS: f32 = 0.0625;
 
@@ -59,6 +69,16 @@ pub struct Counts {
     pub misses: u64,
     /// Records that were found and not gathered again.
     pub reused: u64,
+    /// Finished pixels.
+    pub pixels: u64,
+    /// Samples of finished pixels.
+    pub samples: u64,
+    /// Sum of the squared standard errors of finished pixels, as far as their samples tell; mean of the channels, (W/(sr m²))².
+    pub pixel_variance: f64,
+    /// Sum of the squared standard errors that records bring to finished pixels, in the same unit.
+    pub record_variance: f64,
+    /// Sum of the radiance of finished pixels, mean of the channels, W/(sr m²).
+    pub radiance: f64,
 }
 
 impl Counts {
@@ -69,6 +89,11 @@ impl Counts {
         self.queries += other.queries;
         self.misses += other.misses;
         self.reused += other.reused;
+        self.pixels += other.pixels;
+        self.samples += other.samples;
+        self.pixel_variance += other.pixel_variance;
+        self.record_variance += other.record_variance;
+        self.radiance += other.radiance;
     }
 }
 
@@ -80,16 +105,24 @@ pub struct Frame {
     namespace: Namespace,
     /// Cells of a gather at level 1, at deeper ones, and for a sample of a pixel that no record covers.
     strata: [Strata; 3],
+    /// Cells of gathers that trace as many rays as light varies.
+    ladder: Vec<Strata>,
 }
 
 impl Frame {
     /// Builds what rendering needs.
     pub fn new(scene: Scene, settings: Settings) -> Self {
-        let namespace = settings.namespace(&scene.hash);
-        let world = World::new(scene);
+        Self::of(World::new(scene), settings)
+    }
+
+    fn of(world: World, settings: Settings) -> Self {
+        let namespace = settings.namespace(&world.scene.hash);
         let lights = Lights::new(&world, settings.method != Method::Path);
         let strata = [1.0, DEEPER_RAYS, MISSED_RAYS].map(|f| Strata::new((settings.rays as f32 * f) as u32));
-        Self { world, lights, settings, namespace, strata }
+        let most = if settings.effort.is_some() { settings.rays } else { 0 };
+        let ladder = (0..).map(|i| FIRST_RAYS << i).take_while(|rays| *rays <= most.max(FIRST_RAYS)).map(Strata::new);
+        let ladder = ladder.collect();
+        Self { world, lights, settings, namespace, strata, ladder }
     }
 
     /// The settings it was made with.
@@ -109,6 +142,11 @@ impl Frame {
             Method::Path => 0,
             Method::Irradiance => s.bounces.saturating_add(self.lights.any_gathered().into()).min(LEVELS_MAX),
         }
+    }
+
+    /// The same scene with other settings.
+    pub fn with(self, settings: Settings) -> Self {
+        Self::of(self.world, settings)
     }
 
     /// Tests the candidates of `tile` whose ranks lie in `ranks` and gathers a record of `level` where the sealed
@@ -156,7 +194,7 @@ impl Frame {
             namespace: &self.namespace,
             seed: self.settings.seed,
             level,
-            strata: &self.strata[usize::from(level > 1)],
+            rays: self.rays(level),
             details: &self.settings.details,
         };
         let id = gather.id(&site);
@@ -167,14 +205,26 @@ impl Frame {
         Some(gather.record(id, &site, counts))
     }
 
-    fn tracer<'a>(&'a self, levels: &'a Levels) -> Tracer<'a> {
+    /// How many rays a record of a level is made of.
+    fn rays(&self, level: u32) -> Rays<'_> {
+        let deeper = level > 1;
+        match self.settings.effort {
+            None => Rays::Fixed(&self.strata[usize::from(deeper)]),
+            Some(effort) => {
+                let share = if deeper { DEEPER_EFFORT } else { 1.0 };
+                Rays::Varied { ladder: &self.ladder, per_deviation: effort.rays * share }
+            }
+        }
+    }
+
+    pub(crate) fn tracer<'a>(&'a self, levels: &'a Levels) -> Tracer<'a> {
         let cached = self.settings.method != Method::Path;
         let bounces = self.settings.bounces;
         Tracer { world: &self.world, lights: &self.lights, levels, bounces, cached, regather: None }
     }
 
     /// The candidate of a pixel: the diffuse surface where a path through it has its `level`th meeting.
-    fn site(&self, level: u32, pass: u32, x: u32, y: u32, counts: &mut Counts) -> Option<Site> {
+    pub(crate) fn site(&self, level: u32, pass: u32, x: u32, y: u32, counts: &mut Counts) -> Option<Site> {
         let s = &self.settings;
         let look = rounds::look(level, pass);
         let name = [s.seed, x.into(), y.into(), level.into(), look.into()];
@@ -203,7 +253,8 @@ impl Frame {
                     Spacing::World | Spacing::Free => 4.0 * self.world.radius,
                 };
                 let radius_bounds = (radius_min, radius_max.max(radius_min));
-                return (bsdf.diffuse() != Rgb::ZERO).then_some(Site { at, radius_bounds });
+                let reflectance = bsdf.diffuse().element_sum() * (1.0 / 3.0);
+                return (bsdf.diffuse() != Rgb::ZERO).then_some(Site { at, radius_bounds, reflectance });
             }
             let [a, b, c, _] = sampler.next4();
             let scatter = bsdf.sample(at.frame.to_local(-direction), Part::All, [a, b, c])?;
@@ -220,22 +271,24 @@ impl Frame {
     pub fn pixels(&self, tile: u32, sealed: &Levels) -> (Vec<f32>, Counts) {
         let mut counts = Counts::default();
         let tracer = Tracer { regather: Some(&self.strata[2]), ..self.tracer(sealed) };
-        let mut pixels = Vec::new();
-        for [x, y] in self.settings.pixels(tile) {
-            let seed =
-                (Random::named("pixel", &[self.settings.seed, x.into(), y.into()]).uniform() * (1 << 24) as f32) as u32;
-            let mut sum = [0f32; CHANNELS];
-            for index in 0..self.settings.spp {
-                let mut sampler = Sampler::pixel(index, seed);
-                let [u, v, ..] = sampler.next4();
-                let ray = self.settings.ray(x as f32 + u, y as f32 + v);
-                let seen = tracer.see(ray, 1, Chance::All, &mut sampler, &mut counts);
-                let layers = [seen.total(), seen.direct, seen.indirect, seen.irradiance];
-                let floats = layers.iter().flat_map(|l| l.to_array()).chain([seen.records as f32]);
-                sum.iter_mut().zip(floats).for_each(|(sum, value)| *sum += value);
+        let [x0, x1, y0, y1] = self.settings.tile(tile);
+        let mut pixels: Vec<_> = self.settings.pixels(tile).map(|[x, y]| Pixel::new(&self.settings, x, y)).collect();
+        let spp = self.settings.spp;
+        let first = if self.settings.effort.is_some() { FIRST_SAMPLES.min(spp) } else { spp };
+        pixels.iter_mut().for_each(|pixel| pixel.sample(0..first, &tracer, &self.settings, &mut counts));
+        if let Some(effort) = self.settings.effort {
+            let (width, height) = ((x1 - x0) as usize, (y1 - y0) as usize);
+            let deviations = deviations(&pixels, width, height);
+            for (pixel, deviation) in pixels.iter_mut().zip(deviations) {
+                let wanted = (deviation * effort.samples).clamp(first as f32, spp as f32) as u32;
+                pixel.sample(first..wanted, &tracer, &self.settings, &mut counts);
             }
-            pixels.extend(sum.map(|s| s / self.settings.spp as f32));
         }
-        (pixels, counts)
+        counts.pixels += pixels.len() as u64;
+        counts.samples += pixels.iter().map(|p| u64::from(p.samples)).sum::<u64>();
+        counts.pixel_variance += pixels.iter().map(|p| p.variance() / f64::from(p.samples)).sum::<f64>();
+        counts.record_variance += pixels.iter().map(|p| p.record_deviation().powi(2)).sum::<f64>();
+        counts.radiance += pixels.iter().map(|p| f64::from(p.mean().element_sum()) / 3.0).sum::<f64>();
+        (pixels.iter().flat_map(|p| p.sum.map(|s| s / p.samples as f32)).collect(), counts)
     }
 }

@@ -21,6 +21,22 @@ pub struct Site {
     pub at: Meeting,
     /// Least and greatest R of the record, world lengths.
     pub radius_bounds: (f32, f32),
+    /// Diffuse reflectance, mean of the channels.
+    pub reflectance: f32,
+}
+
+/// How many rays a gather traces.
+#[derive(Clone, Copy)]
+pub enum Rays<'a> {
+    /// One for each of these cells.
+    Fixed(&'a Strata),
+    /// As many as their variance asks for: first those of the first cells, then those of others of the ladder.
+    Varied {
+        /// Cells, each set of twice as many as the one before.
+        ladder: &'a [Strata],
+        /// Rays per W/(sr m²) by which reflected radiance would deviate with one ray.
+        per_deviation: f32,
+    },
 }
 
 /// What a gather needs besides its site.
@@ -34,7 +50,7 @@ pub struct Gather<'a> {
     /// Level of the record.
     pub level: u32,
     /// Cells of the hemisphere.
-    pub strata: &'a Strata,
+    pub rays: Rays<'a>,
     /// What its samples become.
     pub details: &'a Details,
 }
@@ -64,8 +80,22 @@ impl Gather<'_> {
         // A turn of the strata about the normal, so that neighbouring records do not err alike.
         let frame = turned(site.at.frame, random.uniform());
         let mut sampler = Sampler::Stream(random);
-        let samples = self.tracer.hemisphere(&site.at, frame, self.level, self.strata, &mut sampler, counts);
-        let estimate = self.strata.estimate(&samples, self.details);
+        let mut estimate = |strata: &Strata| {
+            let samples = self.tracer.hemisphere(&site.at, frame, self.level, strata, &mut sampler, counts);
+            strata.estimate(&samples, self.details)
+        };
+        let estimate = match self.rays {
+            Rays::Fixed(strata) => estimate(strata),
+            Rays::Varied { ladder, per_deviation } => {
+                let first = estimate(&ladder[0]);
+                let have = ladder[0].rays() as f32;
+                let deviation = first.noise * have.sqrt() * std::f32::consts::FRAC_1_PI * site.reflectance;
+                match ladder.iter().rev().find(|s| s.rays() as f32 * 1.2 <= per_deviation * deviation) {
+                    Some(strata) => estimate(strata).united(strata.rays() as f32, &first, have),
+                    None => first,
+                }
+            }
+        };
         let own = |v: Vec2| site.at.frame.tangential(frame.x * v.x + frame.y * v.y);
         Irradiance {
             id,

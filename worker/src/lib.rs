@@ -12,7 +12,9 @@
 //! - [`sampler`]: where a path's random numbers come from.
 //! - [`trace`]: what a ray sees where it lands: the second door, and the path tracer.
 //! - [`gather`]: a record of irradiance is made.
+//! - [`pixel`]: one pixel as its samples come in.
 //! - [`frame`]: the two kinds of work a worker leases: filling rounds and making pixels.
+//! - [`pilot`]: settings from an error.
 //! - [`solo`]: a frame without a farm.
 //! - [`spec`]: settings on the wire.
 //! - [`credentials`]: tokens and certificates, as a client has them.
@@ -43,9 +45,11 @@ pub mod sampler;
 pub mod trace;
 
 pub mod gather;
+pub mod pixel;
 
 pub mod frame;
 
+pub mod pilot;
 pub mod solo;
 
 pub mod caches;

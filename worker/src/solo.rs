@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use cache_core::Sealed;
-use cache_core::rounds::{Plan, Step};
+use cache_core::rounds::{Plan, RANKS, Step};
 use rayon::prelude::*;
 
 use crate::frame::{CHANNELS, Counts, Frame, Levels};
@@ -20,12 +20,21 @@ pub enum Order {
 
 /// Fills every level of a frame.
 pub fn fill(frame: &Frame, order: Order) -> Levels {
+    fill_ranks(frame, order, RANKS)
+}
+
+/// Fills every level of a frame as far as pixels of ranks below `end` want it; fewer than all in one pass.
+pub fn fill_ranks(frame: &Frame, order: Order, end: u32) -> Levels {
     let (a, details) = (frame.settings().a, frame.settings().details);
     let mut levels: Levels = (0..frame.levels()).map(|_| Arc::new(Sealed::with(a, details))).collect();
     let mut plan = Plan::new(frame.levels());
     let mut gathered = 0;
     while let Some(Step::Fill { level, pass, ranks }) = plan.next(gathered) {
         gathered = 0;
+        if end < RANKS && (pass > 0 || ranks.start >= end) {
+            continue;
+        }
+        let ranks = ranks.start..ranks.end.min(end);
         let steps: Vec<_> = match order {
             Order::Rounds => vec![ranks],
             Order::Sequential => ranks.map(|r| r..r + 1).collect(),

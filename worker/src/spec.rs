@@ -68,6 +68,7 @@ pub fn settings(spec: &v1::FrameSpec) -> Result<Settings, String> {
         rays: spec.rays,
         bounces: spec.bounces,
         seed: spec.seed,
+        effort: None,
         details: Details::default(),
     };
     check(&settings)?;
@@ -117,6 +118,7 @@ pub(crate) mod tests {
             rays: 64,
             bounces: ALL_BOUNCES,
             seed: u64::MAX,
+            effort: None,
             details: Details::default(),
         }
     }

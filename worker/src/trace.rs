@@ -70,6 +70,8 @@ pub struct Seen {
     pub irradiance: Rgb,
     /// How many records gave it.
     pub records: u32,
+    /// Standard error of the radiance for the noise of the records, root mean square over the channels.
+    pub noise: f32,
     /// Distance of the first surface; infinite for none.
     pub distance: f32,
 }
@@ -110,6 +112,7 @@ impl Tracer<'_> {
                     seen.indirect += throughput * bsdf.diffuse() * answer.irradiance * FRAC_1_PI;
                     if depth == first {
                         (seen.irradiance, seen.records) = (answer.irradiance, answer.records);
+                        seen.noise = answer.noise * bsdf.diffuse().length() * (FRAC_1_PI / 3f32.sqrt());
                     }
                     Part::Gloss
                 }
@@ -168,7 +171,7 @@ impl Tracer<'_> {
             // Only what the camera sees is worth a gather of its own: its rays follow paths.
             let tracer = Tracer { regather: None, ..*self };
             let samples = tracer.hemisphere(at, at.frame, depth, strata, &mut sampler.branch(), counts);
-            Answer { irradiance: irradiance(&samples), records: 0 }
+            Answer { irradiance: irradiance(&samples), ..Answer::default() }
         })
     }
 

@@ -1,0 +1,80 @@
+//! Whether a picture is as far from the truth as was asked for, and what that costs.
+
+use std::error::Error;
+
+use worker::frame::{CHANNELS, Frame};
+use worker::pilot;
+use worker::solo::{self, Order};
+use worker::task::CpuClock;
+
+use crate::judge::{SIZE, judge, load, reduce, reference, settings};
+
+/// Which errors to ask for, and of what.
+#[derive(clap::Args)]
+pub struct AskedArgs {
+    /// Scenes as SCENE.DEPTH
+    #[arg(default_values = ["cornell.full", "stairs.full", "leak.full", "sphere-plane.full", "glossy-floor.full", "white-furnace.full"])]
+    scenes: Vec<String>,
+    /// Errors to ask for
+    #[arg(long, value_delimiter = ',', default_values_t = [0.05f32, 0.02, 0.01])]
+    error: Vec<f32>,
+    /// Edge of the pictures, a multiple of 128
+    #[arg(long, default_value_t = SIZE as u32)]
+    edge: u32,
+}
+
+/// Prints one line a picture.
+///
+/// # Errors
+/// Names that are no SCENE.DEPTH.
+pub fn run(args: &AskedArgs) -> Result<(), Box<dyn Error>> {
+    let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
+    println!(
+        "{0}x{0}, one thread; believed: sampling, noise, interpolation. CPU seconds: pilot, fill, pixels",
+        args.edge
+    );
+    println!("scene              asked    RMSE   bias  worst | believed                     | a     spp records | CPU");
+    for name in &args.scenes {
+        let (scene, depth) = name.split_once('.').ok_or("expected SCENE.DEPTH, for instance stairs.full")?;
+        let truth = reference(name);
+        let (scene, camera) = load(&format!("{scene}.glb"));
+        for &error in &args.error {
+            let base =
+                worker::settings::Settings { width: args.edge, height: args.edge, ..settings(camera.clone(), depth) };
+            let frame = Frame::new(scene.clone(), base);
+            let (frame, forecast, records, pixels, counts, seconds) = one_thread.install(|| {
+                let clock = CpuClock::start();
+                let (frame, forecast) = pilot::choose(frame, error);
+                let chosen = clock.seconds();
+                let levels = solo::fill(&frame, Order::Rounds);
+                let filled = clock.seconds();
+                let (pixels, counts) = solo::pixels(&frame, &levels);
+                let seconds = [chosen, filled - chosen, clock.seconds() - filled];
+                (frame, forecast, levels.iter().map(|l| l.len()).collect::<Vec<_>>(), pixels, counts, seconds)
+            });
+            let image: Vec<_> =
+                pixels.chunks_exact(CHANNELS).map(|p| [p[0].into(), p[1].into(), p[2].into()]).collect();
+            let v = judge(&reduce(&image), &truth);
+            let e = pilot::reached(&counts, &forecast);
+            let percent = |v: f64| 100.0 * v;
+            println!(
+                "{name:18} {:4.1}% {:6.2}% {:+5.2}% {:5.2}% | {:5.2}% = {:5.2} {:5.2} {:5.2} (a {:.2}) | {:.2} {:5.1} {records:?} | {:.2} {:.2} {:.2}",
+                percent(error.into()),
+                percent(v.rmse),
+                percent(v.bias),
+                percent(v.worst),
+                percent(e.total()),
+                percent(e.sampling),
+                percent(e.noise),
+                percent(e.interpolation),
+                frame.settings().a,
+                frame.settings().a,
+                counts.samples as f64 / counts.pixels as f64,
+                seconds[0],
+                seconds[1],
+                seconds[2],
+            );
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,83 @@
+//! One pixel as its samples come in: sums of all layers, and how much the samples scatter.
+
+use std::ops::Range;
+
+use cache_core::Rgb;
+use cache_core::id::Random;
+
+use crate::frame::{CHANNELS, Counts};
+use crate::sampler::Sampler;
+use crate::settings::Settings;
+use crate::trace::{Chance, Tracer};
+
+/// A pixel being sampled.
+pub struct Pixel {
+    x: u32,
+    y: u32,
+    seed: u32,
+    /// Sums of the layers, as [`CHANNELS`] says.
+    pub sum: [f32; CHANNELS],
+    squares: Rgb,
+    noise: f32,
+    /// Samples so far.
+    pub samples: u32,
+}
+
+impl Pixel {
+    /// No samples yet.
+    pub fn new(settings: &Settings, x: u32, y: u32) -> Self {
+        let seed = Random::named("pixel", &[settings.seed, x.into(), y.into()]).uniform();
+        let seed = (seed * (1 << 24) as f32) as u32;
+        Self { x, y, seed, sum: [0.0; CHANNELS], squares: Rgb::ZERO, noise: 0.0, samples: 0 }
+    }
+
+    /// Takes samples of these numbers.
+    pub fn sample(&mut self, numbers: Range<u32>, tracer: &Tracer, settings: &Settings, counts: &mut Counts) {
+        for index in numbers {
+            let mut sampler = Sampler::pixel(index, self.seed);
+            let [u, v, ..] = sampler.next4();
+            let ray = settings.ray(self.x as f32 + u, self.y as f32 + v);
+            let seen = tracer.see(ray, 1, Chance::All, &mut sampler, counts);
+            let total = seen.total();
+            let layers = [total, seen.direct, seen.indirect, seen.irradiance];
+            let floats = layers.iter().flat_map(|l| l.to_array()).chain([seen.records as f32]);
+            self.sum.iter_mut().zip(floats).for_each(|(sum, value)| *sum += value);
+            self.squares += total * total;
+            self.noise += seen.noise;
+            self.samples += 1;
+        }
+    }
+
+    /// Mean radiance, W/(sr m²).
+    pub fn mean(&self) -> Rgb {
+        Rgb::from_slice(&self.sum) / self.samples as f32
+    }
+
+    /// Standard error that records bring, W/(sr m²): its samples share their records, so more samples do not lessen it.
+    pub fn record_deviation(&self) -> f64 {
+        f64::from(self.noise / self.samples as f32)
+    }
+
+    /// Variance of one sample, mean of the channels, (W/(sr m²))².
+    pub fn variance(&self) -> f64 {
+        let n = self.samples as f32;
+        if n < 2.0 {
+            return 0.0;
+        }
+        let mean = self.mean();
+        f64::from(((self.squares / n - mean * mean) * (n / (n - 1.0))).max(Rgb::ZERO).element_sum()) / 3.0
+    }
+}
+
+/// Standard deviation of one sample of each pixel of a tile of `width` by `height`, W/(sr m²): few samples may agree by
+/// chance where a shadow begins, so a pixel's neighbours, as far as they are in the tile, have a say.
+pub fn deviations(pixels: &[Pixel], width: usize, height: usize) -> Vec<f32> {
+    let variances: Vec<f64> = pixels.iter().map(Pixel::variance).collect();
+    let around = |at: usize, end: usize| at.saturating_sub(1)..(at + 2).min(end);
+    let of = |x: usize, y: usize| {
+        let near = around(y, height).flat_map(|y| around(x, width).map(move |x| y * width + x));
+        let (sum, count) = near.fold((0.0, 0), |(sum, count), i| (sum + variances[i], count + 1));
+        (0.5 * (variances[y * width + x] + sum / f64::from(count))).sqrt() as f32
+    };
+    (0..pixels.len()).map(|i| of(i % width, i / width)).collect()
+}
