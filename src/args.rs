@@ -2,11 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use cache_core::details::Details;
 use worker::client::Address;
 use worker::credentials::{CredentialArgs, Credentials};
 use worker::scene::{self, Camera, Scene};
 use worker::settings::{ALL_BOUNCES, Method, Settings, defaults};
-use worker::{film, spec};
+use worker::{film, pilot, spec};
 
 use crate::children::Transport;
 use crate::failure::Failure;
@@ -68,9 +69,10 @@ pub struct RenderArgs {
     /// Keep records in this directory between renders, and use those it has of the same scene and settings
     #[arg(long, value_name = "DIR", conflicts_with = "server")]
     pub cache: Option<PathBuf>,
-    /// Not available yet
-    #[arg(long, value_name = "E")]
-    pub error: Option<String>,
+    /// Relative error of the finished picture to aim for, 0.001 to 0.5, in place of --a, --rays and --spp: a small part of
+    /// the picture is looked at first, and what it shows decides
+    #[arg(long, value_name = "E", value_parser = error, conflicts_with_all = ["a", "rays", "spp"])]
+    pub error: Option<f32>,
     /// How own workers reach their server.
     #[arg(long, hide = true, value_enum, default_value_t)]
     pub transport: Transport,
@@ -82,9 +84,6 @@ impl RenderArgs {
     /// # Errors
     /// [`Failure::Usage`].
     pub fn check(&self) -> Result<(), Failure> {
-        if self.error.is_some() {
-            return Err(Failure::usage("--error is not available yet"));
-        }
         if let Some(cache) = self.cache.as_ref().filter(|cache| cache.exists() && !cache.is_dir()) {
             return Err(Failure::usage(format!("--cache {}: expected a directory", cache.display())));
         }
@@ -154,6 +153,9 @@ impl RenderArgs {
             rays: self.rays,
             bounces: self.bounces,
             seed: self.seed,
+            // With --error a pilot decides.
+            effort: None,
+            details: Details::default(),
         };
         spec::check(&settings).map_err(|e| Failure::usage(format!("--{e}")))?;
         Ok(settings)
@@ -207,6 +209,12 @@ fn size(text: &str) -> Result<[u32; 2], String> {
 fn allowed_error(text: &str) -> Result<f32, String> {
     let a = text.parse().ok().filter(|a| *a > 0.0 && *a <= 10.0);
     a.ok_or_else(|| "expected a number more than 0 and at most 10".into())
+}
+
+fn error(text: &str) -> Result<f32, String> {
+    let (least, most) = pilot::ERROR_RANGE;
+    let error = text.parse().ok().filter(|error| (least..=most).contains(error));
+    error.ok_or_else(|| format!("expected a number from {least} to {most}, as 0.02 for 2 %"))
 }
 
 fn bounces(text: &str) -> Result<u32, String> {

@@ -59,10 +59,12 @@ fn why(spec: &FrameSpec, others: &[&Label]) -> Option<String> {
 /// The settings a namespace was made with where they are not the frame's, as options.
 fn differences(spec: &FrameSpec, label: &Label) -> Vec<String> {
     let bounces = |n: u32| if n == ALL_BOUNCES { "all".into() } else { n.to_string() };
+    let by_deviation = spec.effort.map_or(0.0, |effort| effort.rays);
     let pairs = [
         ("method", label.method.clone(), spec.method.clone()),
         ("a", label.a.to_string(), spec.a.to_string()),
         ("rays", label.rays.to_string(), spec.rays.to_string()),
+        ("rays-by-deviation", label.rays_by_deviation.to_string(), by_deviation.to_string()),
         ("bounces", bounces(label.bounces), bounces(spec.bounces)),
         ("seed", label.seed.to_string(), spec.seed.to_string()),
     ];

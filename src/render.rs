@@ -12,9 +12,11 @@ use worker::client::{self, Address, Frames};
 use worker::credentials::Credentials;
 use worker::film::{self, Film};
 use worker::frame::Frame;
+use worker::pilot::{self, Errors, Forecast};
 use worker::scene::{self, Scene};
 use worker::settings::{ALL_BOUNCES, Settings};
 use worker::spec;
+use worker::task;
 use worker::world::World;
 
 use crate::args::RenderArgs;
@@ -83,11 +85,21 @@ async fn render(args: &RenderArgs, credentials: Credentials, children: &mut Chil
     let (mut stats, mut progress) = (Stats::default(), Progress::new(args.quiet, args.workers() > 0));
     stats.phase("load");
     progress.phase("loading the scene");
-    let job = {
+    let frame = {
         let args = args.clone();
-        let loading = tokio::task::spawn_blocking(move || load(&args));
-        loading.await.map_err(|e| Failure::failed(format!("loading the scene failed: {e}")))??
+        off_runtime("loading the scene", move || load(&args)).await??
     };
+    let (frame, forecast) = match args.error {
+        Some(error) => {
+            stats.phase("pilot");
+            progress.phase("looking at a small part of the picture");
+            let (frame, forecast) = off_runtime("the pilot", move || pilot::choose(frame, error)).await?;
+            (frame, Some((error, forecast)))
+        }
+        None => (frame, None),
+    };
+    let job = job(&args.scene, &frame, forecast)?;
+    drop(frame);
     for warning in &job.warnings {
         progress.note(&format!("warning: {warning}"));
     }
@@ -104,23 +116,33 @@ struct Job {
     settings: Settings,
     spec: v1::FrameSpec,
     warnings: Vec<String>,
+    /// The error asked for, and what the pilot made of it.
+    forecast: Option<(f32, Forecast)>,
 }
 
-fn load(args: &RenderArgs) -> Result<Job, Failure> {
+/// Runs what takes long without holding up the runtime.
+async fn off_runtime<T: Send + 'static>(what: &str, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Failure> {
+    tokio::task::spawn_blocking(work).await.map_err(|e| Failure::failed(format!("{what} failed: {e}")))
+}
+
+fn load(args: &RenderArgs) -> Result<Frame, Failure> {
     let scene = scene::load(&args.scene).map_err(Failure::usage)?;
     let settings = args.settings(&scene)?;
-    let unreadable = |e: &dyn std::fmt::Display| Failure::usage(format!("{}: {e}", args.scene.display()));
-    let path = std::fs::canonicalize(&args.scene).map_err(|e| unreadable(&e))?;
-    let path =
-        path.to_str().ok_or_else(|| unreadable(&"the path is not UTF-8, workers could not be told"))?.to_string();
+    Ok(Frame::new(scene, settings))
+}
+
+fn job(path: &Path, frame: &Frame, forecast: Option<(f32, Forecast)>) -> Result<Job, Failure> {
+    let (scene, shown) = (frame.scene(), path.display());
+    let unreadable = |e: &dyn std::fmt::Display| Failure::usage(format!("{shown}: {e}"));
+    let path = std::fs::canonicalize(path).map_err(|e| unreadable(&e))?;
+    let path = path.to_str().ok_or_else(|| unreadable(&"the path is not UTF-8, workers could not be told"))?;
     let mut warnings = scene.warnings.clone();
-    if !is_lit(&scene) {
-        warnings.push(format!("{} has no light: the picture will be black", args.scene.display()));
+    if !is_lit(scene) {
+        warnings.push(format!("{shown} has no light: the picture will be black"));
     }
-    let hash = scene.hash;
     // Only the renderer itself knows how many levels a scene needs.
-    let frame = Frame::new(scene, settings.clone());
-    Ok(Job { settings, spec: spec::message(&frame, &path, &hash), warnings })
+    let spec = spec::message(frame, path, &scene.hash);
+    Ok(Job { settings: frame.settings().clone(), spec, warnings, forecast })
 }
 
 fn is_lit(scene: &Scene) -> bool {
@@ -350,7 +372,7 @@ impl Render<'_> {
         self.progress.finish();
         let seconds = self.stats.seconds();
         if let Some(path) = &self.args.stats {
-            let json = std::mem::take(&mut self.stats).json(told(job), done);
+            let json = std::mem::take(&mut self.stats).json(told(job, done), done);
             let text = format!("{json:#}\n");
             files.push(film::stage(path, text.as_bytes()).map_err(Failure::failed)?);
         }
@@ -365,11 +387,15 @@ impl Render<'_> {
             return Ok(());
         }
         say::result(format_args!(
-            "{} and {}: {seconds:.1} s, {} records, {} rounds",
+            "{} and {}: {seconds:.1} s, {} records, {} rounds{}",
             self.args.output.display(),
             self.args.png().display(),
             done.records,
-            done.rounds
+            done.rounds,
+            job.forecast.map_or(String::new(), |(asked, forecast)| {
+                let believed = 100.0 * believed(&forecast, done).total();
+                format!("; error asked {} %, believed {believed:.2} %", 100.0 * asked)
+            })
         ))
     }
 }
@@ -408,6 +434,8 @@ fn attributes(job: &Job, done: &v1::FrameDone) -> Vec<(&'static str, String)> {
         ("rays", s.rays.to_string()),
         ("bounces", bounces(s)),
         ("seed", s.seed.to_string()),
+        ("error", job.forecast.map_or("-".into(), |(error, _)| error.to_string())),
+        ("effort", s.effort.map_or("-".into(), |e| format!("{} {}", e.rays, e.samples))),
         ("records", done.records.to_string()),
         ("camera_eye", vector(s.camera.eye)),
         ("camera_forward", vector(s.camera.forward)),
@@ -417,8 +445,28 @@ fn attributes(job: &Job, done: &v1::FrameDone) -> Vec<(&'static str, String)> {
     ]
 }
 
+/// What the picture itself tells of its error: sampling and noise from all of its pixels, interpolation from the pilot.
+fn believed(forecast: &Forecast, done: &v1::FrameDone) -> Errors {
+    let count = |name: &str| done.counts.iter().filter(|c| c.name == name).map(|c| c.value).sum();
+    pilot::reached(&task::sums(count), forecast)
+}
+
+/// What the statistics say about the error asked for and reached, relative to the picture's mean radiance.
+fn error(asked: f32, forecast: &Forecast, done: &v1::FrameDone) -> Value {
+    let parts = |e: &Errors| json!({ "total": e.total(), "sampling": e.sampling, "noise": e.noise, "interpolation": e.interpolation });
+    json!({
+        "asked": asked.to_string().parse::<f64>().unwrap_or(asked.into()),
+        "forecast": parts(&forecast.errors),
+        "believed": parts(&believed(forecast, done)),
+        "why": "sampling: how much the samples of each finished pixel scatter; noise: how much the rays of the records each \
+                finished pixel was made of scatter; interpolation: what records of the pilot were off by where it gathered \
+                anew, times the square of a over the pilot's",
+        "pilot_rays": forecast.counts.path_rays + forecast.counts.shadow_rays,
+    })
+}
+
 /// What the statistics say about scene and settings.
-fn told(job: &Job) -> Map<String, Value> {
+fn told(job: &Job, done: &v1::FrameDone) -> Map<String, Value> {
     let s = &job.settings;
     let told = json!({
         "version": VERSION,
@@ -436,7 +484,10 @@ fn told(job: &Job) -> Map<String, Value> {
             "bounces": bounces(s),
             "seed": s.seed,
             "levels": job.spec.levels,
+            "rays_by_deviation": s.effort.map(|effort| effort.rays),
+            "samples_by_deviation": s.effort.map(|effort| effort.samples),
         },
+        "error": job.forecast.map(|(asked, forecast)| error(asked, &forecast, done)),
     });
     match told {
         Value::Object(map) => map,

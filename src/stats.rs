@@ -85,6 +85,7 @@ impl Stats {
             "rays": { "path": by_phase("rays.path.", whole), "shadow": by_phase("rays.shadow.", whole) },
             "queries": count("queries"),
             "misses": count("misses"),
+            "samples": count("samples"),
             "bytes": {
                 "records_inserted": count("bytes.inserted"),
                 "records_subscribed": count("bytes.subscribed"),

@@ -69,7 +69,7 @@ pub fn run(args: &AskedArgs) -> Result<(), Box<dyn Error>> {
                 percent(e.interpolation),
                 frame.settings().a,
                 frame.settings().a,
-                counts.samples as f64 / counts.pixels as f64,
+                counts.samples as f64 / f64::from(args.edge * args.edge),
                 seconds[0],
                 seconds[1],
                 seconds[2],

@@ -120,7 +120,8 @@ impl Board {
         } else {
             self.base(&namespace, convert::digest(&base)?).await
         };
-        let view = v1::FrameSpec { scene: String::new(), spp: 0, ..job.spec.clone() };
+        let effort = job.spec.effort.map(|effort| v1::Effort { samples: 0.0, ..effort });
+        let view = v1::FrameSpec { scene: String::new(), spp: 0, effort, ..job.spec.clone() };
         let view = [view.encode_to_vec(), cache_proto::VERSION.into()].concat();
         let draft = namespace.draft(base.sum.digest, &view);
         if job.spec.levels > 0 {
@@ -268,6 +269,7 @@ fn label(job: &Job, tenant: &str, namespace: Namespace, draft_of: Option<Namespa
         method: spec.method.clone(),
         a: spec.a,
         rays: spec.rays,
+        rays_by_deviation: spec.effort.map_or(0.0, |effort| effort.rays),
         bounces: spec.bounces,
         seed: spec.seed,
         owner: tenant.into(),

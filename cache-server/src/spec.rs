@@ -49,6 +49,11 @@ impl Job {
                 return Err(Refusal::field("a", format!("is {}, expected more than 0 and at most 10", spec.a)));
             }
         }
+        if let Some(v1::Effort { rays, samples }) = spec.effort
+            && !(rays > 0.0 && rays.is_finite() && samples > 0.0 && samples.is_finite())
+        {
+            return Err(Refusal::field("effort", format!("is {rays} and {samples}, expected both to be more than 0")));
+        }
         let [columns, rows] = [spec.width, spec.height].map(|edge| u64::from(edge.div_ceil(spec.tile_size)));
         let tiles = columns * rows;
         if tiles > TILES_MAX {

@@ -47,8 +47,11 @@ const DEEPER_EFFORT: f32 = 0.25;
 /// Rays by which such a gather finds out how much light varies.
 const FIRST_RAYS: u32 = 32;
 
+/// Shadow rays of each sample of a pixel, where samples are as many as light varies.
+const LOOKS: u32 = 4;
+
 /// Samples by which a pixel finds out.
-const FIRST_SAMPLES: u32 = 8;
+const FIRST_SAMPLES: u32 = 4;
 
 /// Rays gathered for a sample of a pixel that no record covers, as a fraction: its pixel's other samples share the error.
 const MISSED_RAYS: f32 = 0.0625;
@@ -69,16 +72,41 @@ pub struct Counts {
     pub misses: u64,
     /// Records that were found and not gathered again.
     pub reused: u64,
-    /// Finished pixels.
-    pub pixels: u64,
     /// Samples of finished pixels.
     pub samples: u64,
-    /// Sum of the squared standard errors of finished pixels, as far as their samples tell; mean of the channels, (W/(sr m²))².
-    pub pixel_variance: f64,
-    /// Sum of the squared standard errors that records bring to finished pixels, in the same unit.
-    pub record_variance: f64,
-    /// Sum of the radiance of finished pixels, mean of the channels, W/(sr m²).
+    /// What finished pixels that see surfaces alone add up to.
+    pub surfaces: Sums,
+    /// What the others add up to, which look straight into light.
+    pub lights: Sums,
+}
+
+/// What pixels add up to.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Sums {
+    /// How many.
+    pub pixels: u64,
+    /// Radiance, mean of the channels, W/(sr m²).
     pub radiance: f64,
+    /// Standard deviation of one sample, W/(sr m²).
+    pub deviation: f64,
+    /// Squared standard error, as far as samples tell; mean of the channels, (W/(sr m²))².
+    pub sampling: f64,
+    /// Standard error that records bring, root mean square over the channels, W/(sr m²).
+    pub noise: f64,
+    /// The same squared.
+    pub noise_squared: f64,
+}
+
+impl Sums {
+    /// Adds what was summed elsewhere.
+    pub fn add(&mut self, other: &Self) {
+        self.pixels += other.pixels;
+        self.radiance += other.radiance;
+        self.deviation += other.deviation;
+        self.sampling += other.sampling;
+        self.noise += other.noise;
+        self.noise_squared += other.noise_squared;
+    }
 }
 
 impl Counts {
@@ -89,11 +117,33 @@ impl Counts {
         self.queries += other.queries;
         self.misses += other.misses;
         self.reused += other.reused;
-        self.pixels += other.pixels;
         self.samples += other.samples;
-        self.pixel_variance += other.pixel_variance;
-        self.record_variance += other.record_variance;
-        self.radiance += other.radiance;
+        self.surfaces.add(&other.surfaces);
+        self.lights.add(&other.lights);
+    }
+
+    /// Counts a finished pixel.
+    pub fn finish(&mut self, pixel: &Pixel) {
+        let (variance, noise) = (pixel.variance(), pixel.record_deviation());
+        self.samples += u64::from(pixel.samples);
+        let sums = if pixel.sees_light { &mut self.lights } else { &mut self.surfaces };
+        sums.add(&Sums {
+            pixels: 1,
+            radiance: f64::from(pixel.mean().element_sum()) / 3.0,
+            deviation: variance.sqrt(),
+            sampling: pixel.squared_error(),
+            noise,
+            noise_squared: noise * noise,
+        });
+    }
+
+    /// What counts in an error: pixels that see surfaces; all, where more than one in twenty looks into light.
+    pub fn judged(&self) -> Sums {
+        let mut sums = self.surfaces;
+        if self.lights.pixels * 20 > self.surfaces.pixels + self.lights.pixels {
+            sums.add(&self.lights);
+        }
+        sums
     }
 }
 
@@ -128,6 +178,11 @@ impl Frame {
     /// The settings it was made with.
     pub fn settings(&self) -> &Settings {
         &self.settings
+    }
+
+    /// The scene.
+    pub fn scene(&self) -> &Scene {
+        &self.world.scene
     }
 
     /// Where its records belong.
@@ -220,7 +275,12 @@ impl Frame {
     pub(crate) fn tracer<'a>(&'a self, levels: &'a Levels) -> Tracer<'a> {
         let cached = self.settings.method != Method::Path;
         let bounces = self.settings.bounces;
-        Tracer { world: &self.world, lights: &self.lights, levels, bounces, cached, regather: None }
+        Tracer { world: &self.world, lights: &self.lights, levels, bounces, cached, looks: 1, regather: None }
+    }
+
+    /// Traces samples of pixels that are as many as light varies.
+    pub(crate) fn looking<'a>(&'a self, levels: &'a Levels) -> Tracer<'a> {
+        Tracer { looks: if self.lights.any_sampled() { LOOKS } else { 1 }, ..self.tracer(levels) }
     }
 
     /// The candidate of a pixel: the diffuse surface where a path through it has its `level`th meeting.
@@ -270,7 +330,8 @@ impl Frame {
     /// The finished pixels of `tile`, row by row, [`CHANNELS`] floats each.
     pub fn pixels(&self, tile: u32, sealed: &Levels) -> (Vec<f32>, Counts) {
         let mut counts = Counts::default();
-        let tracer = Tracer { regather: Some(&self.strata[2]), ..self.tracer(sealed) };
+        let looking = if self.settings.effort.is_some() { self.looking(sealed) } else { self.tracer(sealed) };
+        let tracer = Tracer { regather: Some(&self.strata[2]), ..looking };
         let [x0, x1, y0, y1] = self.settings.tile(tile);
         let mut pixels: Vec<_> = self.settings.pixels(tile).map(|[x, y]| Pixel::new(&self.settings, x, y)).collect();
         let spp = self.settings.spp;
@@ -284,11 +345,7 @@ impl Frame {
                 pixel.sample(first..wanted, &tracer, &self.settings, &mut counts);
             }
         }
-        counts.pixels += pixels.len() as u64;
-        counts.samples += pixels.iter().map(|p| u64::from(p.samples)).sum::<u64>();
-        counts.pixel_variance += pixels.iter().map(|p| p.variance() / f64::from(p.samples)).sum::<f64>();
-        counts.record_variance += pixels.iter().map(|p| p.record_deviation().powi(2)).sum::<f64>();
-        counts.radiance += pixels.iter().map(|p| f64::from(p.mean().element_sum()) / 3.0).sum::<f64>();
+        pixels.iter().for_each(|pixel| counts.finish(pixel));
         (pixels.iter().flat_map(|p| p.sum.map(|s| s / p.samples as f32)).collect(), counts)
     }
 }

@@ -119,6 +119,11 @@ impl Lights {
         self.gathered
     }
 
+    /// Whether there is any light for shadow rays to look for.
+    pub fn any_sampled(&self) -> bool {
+        !self.lights.is_empty()
+    }
+
     /// Whether shadow rays look for the light of a triangle.
     pub fn samples_triangle(&self, triangle: u32) -> bool {
         self.of_triangle[triangle as usize] != NONE

@@ -12,7 +12,7 @@ use cache_core::rounds::{RANKS, rank};
 
 use crate::frame::{Counts, Frame, Levels};
 use crate::gather::{Gather, Rays};
-use crate::pixel::Pixel;
+use crate::pixel::{Pixel, SPREAD};
 use crate::settings::{Effort, Settings};
 use crate::solo::{self, Order};
 
@@ -25,12 +25,12 @@ const PIXELS: u32 = 4096;
 /// Of those, where records are tested against a gather of their own.
 const PROBES: usize = 256;
 
-/// Allowed error a of the pilot's records, and rays of their gathers.
+/// Allowed error a of the pilot's records. What they err by grows with its square: their gradients take the linear part.
 const A: f32 = 0.6;
-const RAYS: u32 = 128;
 
-/// Rays of a gather that records are tested against.
-const PROBE_RAYS: u32 = 512;
+/// Rays of their gathers, times the square of the error asked for: their noise must not hide what interpolation errs by.
+const RAYS: f32 = 0.4;
+const RAYS_RANGE: (f32, f32) = (64.0, 2048.0);
 
 /// Samples of each of the pilot's pixels.
 const SPP: u32 = 8;
@@ -38,14 +38,18 @@ const SPP: u32 = 8;
 /// What a picture may reach for, as a fraction of the error asked: forecasts err.
 const AIM: f64 = 0.75;
 
-/// Shares of the mean square for sampling, noise and interpolation.
+/// Divisions of the mean square that are weighed against each other, and one for pictures without light.
+const STEPS: u32 = 63;
 const SHARES: [f64; 3] = [0.4, 0.35, 0.25];
+
+/// What more samples than the pilot's leave of the variance, besides [`SPREAD`].
+const WELL_SPREAD: f64 = 0.7;
 
 /// A record's noise over that of an answer, which is the mean of several records.
 const RECORDS_AT_ONCE: f64 = 1.7;
 
 /// Bounds of what may be chosen.
-const A_RANGE: (f64, f64) = (0.2, 1.0);
+const A_RANGE: (f64, f64) = (0.2, 0.8);
 const RAYS_MOST: u32 = 16384;
 const SPP_MOST: u32 = 4096;
 
@@ -74,8 +78,6 @@ pub struct Forecast {
     pub radiance: f64,
     /// What the chosen settings should reach.
     pub errors: Errors,
-    /// Pixels it looked at.
-    pub pixels: usize,
     /// What it cost.
     pub counts: Counts,
 }
@@ -84,40 +86,65 @@ pub struct Forecast {
 /// why. What `frame`'s settings say of view, size, bounces, method and seed stays.
 pub fn choose(frame: Frame, error: f32) -> (Frame, Forecast) {
     let asked = frame.settings().clone();
-    let trial = Settings { a: A, rays: RAYS, spp: SPP, effort: None, ..asked.clone() };
+    let few = (RAYS / (error * error)).clamp(RAYS_RANGE.0, RAYS_RANGE.1) as u32;
+    let trial = Settings { a: A, rays: few, spp: SPP, effort: None, ..asked.clone() };
     let frame = frame.with(trial);
     let seen = look(&frame);
     let most = 1.0 / seen.radiance.max(f64::MIN_POSITIVE);
     let aim = (f64::from(error) * AIM).powi(2);
 
     // Mean squares relative to the mean radiance: sampling and noise for an effort of 1, interpolation at the pilot's a.
-    let sampling = seen.deviation * most * most;
-    let noise = seen.noise * f64::from(RAYS).sqrt() / RECORDS_AT_ONCE * most * most;
+    let sampling = seen.deviation * most * most * SPREAD * WELL_SPREAD;
+    let noise = seen.noise * f64::from(few).sqrt() / RECORDS_AT_ONCE * most * most;
     let interpolation = seen.interpolation * most * most;
-    // What each can reach at most: with the fewest samples, the fewest rays, the greatest a.
-    let cached = frame.levels() > 0;
-    let greatest = interpolation * (A_RANGE.1 / f64::from(A)).powi(2);
-    let mut shares = SHARES.map(|share| share * aim);
-    if !cached {
-        shares = [aim, 0.0, 0.0];
-    } else if greatest < shares[2] {
-        let rest = shares[2] - greatest;
-        shares = [shares[0] + rest * 0.5, shares[1] + rest * 0.5, greatest];
-    }
-    let a = if interpolation > 0.0 { f64::from(A) * (shares[2] / interpolation).sqrt() } else { A_RANGE.1 };
-    let a = a.clamp(A_RANGE.0, A_RANGE.1);
-    let samples = sampling / shares[0];
-    let rays = if cached { noise / shares[1] } else { 1.0 };
+    let [for_sampling, for_noise, for_interpolation] = if frame.levels() == 0 {
+        [aim, f64::INFINITY, f64::INFINITY]
+    } else {
+        // Rays it takes to bring either mean square to 1: of all pixels, and of as many records as the pilot made.
+        let pixels = f64::from(asked.width) * f64::from(asked.height);
+        let by_sampling = pixels * seen.rays_a_sample * seen.deviation * sampling;
+        let by_noise = seen.rays_of_fill * (seen.noise * most).powi(2);
+        divide(aim, [by_sampling, by_noise], interpolation)
+    };
+    let a = f64::from(A) * (for_interpolation / interpolation).powf(0.25);
+    let a = stepped(if a.is_nan() { A_RANGE.1 } else { a.clamp(A_RANGE.0, A_RANGE.1) });
+    let (samples, rays) = (sampling / for_sampling, stepped(noise / for_noise));
     let errors = Errors {
-        sampling: shares[0].sqrt(),
-        noise: shares[1].sqrt(),
-        interpolation: interpolation.sqrt() * a / f64::from(A),
+        sampling: for_sampling.sqrt(),
+        noise: if for_noise.is_finite() { for_noise.sqrt() } else { 0.0 },
+        interpolation: interpolation.sqrt() * (a / f64::from(A)).powi(2),
     };
     let positive = |effort: f64| (effort as f32).clamp(f32::MIN_POSITIVE, f32::MAX);
-    let effort = Effort { rays: positive(rays / most), samples: positive(samples / most) };
+    let effort = Effort { rays: positive(rays), samples: positive(samples) };
     let chosen = Settings { a: a as f32, rays: RAYS_MOST, spp: SPP_MOST, effort: Some(effort), ..asked };
-    let forecast = Forecast { radiance: seen.radiance, errors, pixels: seen.pixels, counts: seen.counts };
+    let forecast = Forecast { radiance: seen.radiance, errors, counts: seen.counts };
     (frame.with(chosen), forecast)
+}
+
+/// Shares a mean square among sampling, noise and interpolation so that it costs the fewest rays.
+///
+/// `costs` are the rays that bring sampling and noise to 1, in inverse proportion; `interpolation` is the mean square at
+/// the pilot's a: its root falls as the number of records grows, each of which needs its rays.
+fn divide(aim: f64, costs: [f64; 2], interpolation: f64) -> [f64; 3] {
+    // More than the greatest a errs by cannot be had.
+    let most = interpolation * (A_RANGE.1 / f64::from(A)).powi(4);
+    let shares = |k: u32| {
+        let noise = aim * f64::from(k) / f64::from(STEPS + 1);
+        // Where the derivatives of the cost agree.
+        let between = (noise * 0.5).min(most);
+        [aim - noise - between, noise, between]
+    };
+    let cost = |[sampling, noise, between]: [f64; 3]| {
+        let records = if between > 0.0 { (interpolation / between).sqrt() } else { 1.0 };
+        costs[0] / sampling + costs[1] * records.max(0.1) / noise
+    };
+    let possible = (1..=STEPS).map(shares).filter(|shares| shares[0] > 0.0);
+    possible.min_by(|a, b| cost(*a).total_cmp(&cost(*b))).unwrap_or(SHARES.map(|share| share * aim))
+}
+
+/// The nearest power of the root of 2: views of one scene that look much the same choose the same, and share records.
+fn stepped(value: f64) -> f64 {
+    if value > 0.0 && value.is_finite() { 2f64.powf((value.log2() * 2.0).round() / 2.0) } else { value }
 }
 
 /// Means over the pilot's pixels; radiance in W/(sr m²).
@@ -130,7 +157,8 @@ struct Seen {
     noise: f64,
     /// Mean square of what interpolation is off by.
     interpolation: f64,
-    pixels: usize,
+    rays_a_sample: f64,
+    rays_of_fill: f64,
     counts: Counts,
 }
 
@@ -138,22 +166,22 @@ fn look(frame: &Frame) -> Seen {
     let settings = frame.settings();
     let size = settings.width * settings.height;
     let ranks = (u64::from(RANKS) * u64::from(PIXELS) / u64::from(size.max(1))).clamp(1, RANKS.into()) as u32;
-    let levels = solo::fill_ranks(frame, Order::Rounds, ranks);
-    let mut seen = Seen::default();
-    let tracer = frame.tracer(&levels);
+    let (levels, filling) = solo::fill_ranks(frame, Order::Rounds, ranks);
+    let rays = |counts: &Counts| (counts.path_rays + counts.shadow_rays) as f64;
+    let mut seen = Seen { rays_of_fill: rays(&filling), ..Seen::default() };
+    let tracer = frame.looking(&levels);
     let pixels = || (0..settings.height).flat_map(|y| (0..settings.width).map(move |x| [x, y]));
     for [x, y] in pixels().filter(|[x, y]| rank(*x, *y) < ranks) {
         let mut pixel = Pixel::new(settings, x, y);
         pixel.sample(0..SPP, &tracer, settings, &mut seen.counts);
-        seen.radiance += f64::from(pixel.mean().element_sum()) / 3.0;
-        seen.deviation += pixel.variance().sqrt();
-        seen.noise += pixel.record_deviation();
-        seen.pixels += 1;
+        seen.counts.finish(&pixel);
     }
-    let count = seen.pixels.max(1) as f64;
-    seen.radiance /= count;
-    seen.deviation /= count;
-    seen.noise /= count;
+    let sums = seen.counts.judged();
+    let count = sums.pixels.max(1) as f64;
+    // A look into the cache takes about as long as a ray.
+    seen.rays_a_sample = (rays(&seen.counts) + seen.counts.queries as f64) / seen.counts.samples.max(1) as f64;
+    (seen.radiance, seen.deviation, seen.noise) = (sums.radiance / count, sums.deviation / count, sums.noise / count);
+    seen.counts.add(&filling);
     if !levels.is_empty() {
         seen.interpolation = probe(frame, &levels, &mut seen.counts);
     }
@@ -165,7 +193,7 @@ fn probe(frame: &Frame, levels: &Levels, counts: &mut Counts) -> f64 {
     let settings = frame.settings();
     let mut random = Random::named("probe", &[settings.seed]);
     let mut place = |size: u32| ((random.uniform() * size as f32) as u32).min(size - 1);
-    let strata = Strata::new(PROBE_RAYS);
+    let strata = Strata::new(2 * settings.rays);
     let gather = Gather {
         tracer: &frame.tracer(levels),
         namespace: frame.namespace(),
@@ -192,11 +220,12 @@ fn probe(frame: &Frame, levels: &Levels, counts: &mut Counts) -> f64 {
 /// What was reached, as far as the finished picture itself can tell: sampling and noise are measured on all its pixels,
 /// interpolation is the forecast's.
 pub fn reached(counts: &Counts, forecast: &Forecast) -> Errors {
-    let pixels = counts.pixels.max(1) as f64;
-    let mean = (counts.radiance / pixels).max(f64::MIN_POSITIVE);
+    let sums = counts.judged();
+    let pixels = sums.pixels.max(1) as f64;
+    let mean = (sums.radiance / pixels).max(f64::MIN_POSITIVE);
     Errors {
-        sampling: (counts.pixel_variance / pixels).sqrt() / mean,
-        noise: (counts.record_variance / pixels).sqrt() / mean,
+        sampling: (sums.sampling / pixels).sqrt() / mean,
+        noise: (sums.noise_squared / pixels).sqrt() / mean,
         interpolation: forecast.errors.interpolation,
     }
 }

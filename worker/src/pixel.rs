@@ -10,6 +10,10 @@ use crate::sampler::Sampler;
 use crate::settings::Settings;
 use crate::trace::{Chance, Tracer};
 
+/// What Sobol points leave of the variance that as many random points would have, four of them; more leave less. Fitted to
+/// the errors met with 4 to 64 samples on cornell, stairs and glossy-floor.
+pub const SPREAD: f64 = 0.45;
+
 /// A pixel being sampled.
 pub struct Pixel {
     x: u32,
@@ -17,10 +21,13 @@ pub struct Pixel {
     seed: u32,
     /// Sums of the layers, as [`CHANNELS`] says.
     pub sum: [f32; CHANNELS],
+    reflected: Rgb,
     squares: Rgb,
     noise: f32,
     /// Samples so far.
     pub samples: u32,
+    /// Whether one of them looks straight into light.
+    pub sees_light: bool,
 }
 
 impl Pixel {
@@ -28,7 +35,17 @@ impl Pixel {
     pub fn new(settings: &Settings, x: u32, y: u32) -> Self {
         let seed = Random::named("pixel", &[settings.seed, x.into(), y.into()]).uniform();
         let seed = (seed * (1 << 24) as f32) as u32;
-        Self { x, y, seed, sum: [0.0; CHANNELS], squares: Rgb::ZERO, noise: 0.0, samples: 0 }
+        Self {
+            x,
+            y,
+            seed,
+            sum: [0.0; CHANNELS],
+            reflected: Rgb::ZERO,
+            squares: Rgb::ZERO,
+            sees_light: false,
+            noise: 0.0,
+            samples: 0,
+        }
     }
 
     /// Takes samples of these numbers.
@@ -42,7 +59,10 @@ impl Pixel {
             let layers = [total, seen.direct, seen.indirect, seen.irradiance];
             let floats = layers.iter().flat_map(|l| l.to_array()).chain([seen.records as f32]);
             self.sum.iter_mut().zip(floats).for_each(|(sum, value)| *sum += value);
-            self.squares += total * total;
+            let reflected = total - seen.emission;
+            self.reflected += reflected;
+            self.squares += reflected * reflected;
+            self.sees_light |= seen.emission != Rgb::ZERO;
             self.noise += seen.noise;
             self.samples += 1;
         }
@@ -53,18 +73,25 @@ impl Pixel {
         Rgb::from_slice(&self.sum) / self.samples as f32
     }
 
+    /// Squared standard error of the reflected light, mean of the channels, (W/(sr m²))².
+    pub fn squared_error(&self) -> f64 {
+        let n = f64::from(self.samples.max(1));
+        self.variance() / n * SPREAD * (4.0 / n).min(1.0).powf(0.25)
+    }
+
     /// Standard error that records bring, W/(sr m²): its samples share their records, so more samples do not lessen it.
     pub fn record_deviation(&self) -> f64 {
         f64::from(self.noise / self.samples as f32)
     }
 
-    /// Variance of one sample, mean of the channels, (W/(sr m²))².
+    /// Variance of the reflected light of one sample, mean of the channels, (W/(sr m²))². How an edge of a lamp is covered
+    /// is another matter: no number of samples would do where it is a thousand times brighter than what it lights.
     pub fn variance(&self) -> f64 {
         let n = self.samples as f32;
         if n < 2.0 {
             return 0.0;
         }
-        let mean = self.mean();
+        let mean = self.reflected / n;
         f64::from(((self.squares / n - mean * mean) * (n / (n - 1.0))).max(Rgb::ZERO).element_sum()) / 3.0
     }
 }

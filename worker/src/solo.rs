@@ -20,11 +20,12 @@ pub enum Order {
 
 /// Fills every level of a frame.
 pub fn fill(frame: &Frame, order: Order) -> Levels {
-    fill_ranks(frame, order, RANKS)
+    fill_ranks(frame, order, RANKS).0
 }
 
 /// Fills every level of a frame as far as pixels of ranks below `end` want it; fewer than all in one pass.
-pub fn fill_ranks(frame: &Frame, order: Order, end: u32) -> Levels {
+pub fn fill_ranks(frame: &Frame, order: Order, end: u32) -> (Levels, Counts) {
+    let mut counts = Counts::default();
     let (a, details) = (frame.settings().a, frame.settings().details);
     let mut levels: Levels = (0..frame.levels()).map(|_| Arc::new(Sealed::with(a, details))).collect();
     let mut plan = Plan::new(frame.levels());
@@ -43,14 +44,16 @@ pub fn fill_ranks(frame: &Frame, order: Order, end: u32) -> Levels {
             // The pixels of one rank are 64 apart; strictly sequential filling seals after each of them all the same.
             let chunk = if order == Order::Rounds { u32::MAX } else { 1 };
             for tiles in chunks(frame.settings().tiles(), chunk) {
-                let work = |tile| frame.fill(level, pass, ranks.clone(), tile, &levels, &|_| None).0;
-                let new: Vec<_> = tiles.into_par_iter().map(work).collect::<Vec<_>>().concat();
+                let work = |tile| frame.fill(level, pass, ranks.clone(), tile, &levels, &|_| None);
+                let done: Vec<_> = tiles.into_par_iter().map(work).collect();
+                done.iter().for_each(|(_, counted)| counts.add(counted));
+                let new: Vec<_> = done.into_iter().flat_map(|(records, _)| records).collect();
                 gathered += new.len() as u64;
                 Arc::make_mut(&mut levels[level as usize - 1]).extend(new);
             }
         }
     }
-    levels
+    (levels, counts)
 }
 
 fn chunks(tiles: u32, size: u32) -> impl Iterator<Item = std::ops::Range<u32>> {

@@ -7,7 +7,7 @@ use glam::Vec3;
 
 use crate::frame::Frame;
 use crate::scene::Camera;
-use crate::settings::{Method, Settings, TILE};
+use crate::settings::{Effort, Method, Settings, TILE};
 
 /// The message that describes a frame of the scene at `path` (as every worker can open it) with content `hash`.
 pub fn message(frame: &Frame, path: &str, hash: &[u8; 32]) -> v1::FrameSpec {
@@ -37,6 +37,7 @@ fn written(settings: &Settings, levels: u32, namespace: &Namespace, path: &str, 
         bounces: settings.bounces,
         seed: settings.seed,
         levels,
+        effort: settings.effort.map(|Effort { rays, samples }| v1::Effort { rays, samples }),
     }
 }
 
@@ -68,7 +69,7 @@ pub fn settings(spec: &v1::FrameSpec) -> Result<Settings, String> {
         rays: spec.rays,
         bounces: spec.bounces,
         seed: spec.seed,
-        effort: None,
+        effort: spec.effort.map(|v1::Effort { rays, samples }| Effort { rays, samples }),
         details: Details::default(),
     };
     check(&settings)?;
@@ -94,6 +95,11 @@ pub fn check(settings: &Settings) -> Result<(), String> {
     if !(settings.a > 0.0 && settings.a <= 10.0) {
         return Err(format!("a is {}, expected more than 0 and at most 10", settings.a));
     }
+    for (value, name) in settings.effort.iter().flat_map(|e| [(e.rays, "effort.rays"), (e.samples, "effort.samples")]) {
+        if !(value > 0.0 && value.is_finite()) {
+            return Err(format!("{name} is {value}, expected more than 0"));
+        }
+    }
     Ok(())
 }
 
@@ -118,7 +124,7 @@ pub(crate) mod tests {
             rays: 64,
             bounces: ALL_BOUNCES,
             seed: u64::MAX,
-            effort: None,
+            effort: Some(Effort { rays: 3.5, samples: 0.1 }),
             details: Details::default(),
         }
     }
@@ -137,6 +143,7 @@ pub(crate) mod tests {
             change(&mut spec);
             settings(&spec).expect_err("out of range")
         };
+        assert_eq!(wrong(|s| s.effort = Some(v1::Effort::default())), "effort.rays is 0, expected more than 0");
         assert_eq!(wrong(|s| s.width = 0), "width is 0, expected 1 to 65536");
         assert_eq!(wrong(|s| s.a = f32::NAN), "a is NaN, expected more than 0 and at most 10");
         assert_eq!(wrong(|s| s.method = "magic".into()), "method \"magic\" is unknown here");

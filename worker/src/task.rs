@@ -7,7 +7,7 @@ use cache_core::rounds::Step;
 use cache_core::{Irradiance, Tag};
 use cache_proto::{convert, v1};
 
-use crate::frame::{Counts, Frame};
+use crate::frame::{Counts, Frame, Sums};
 use crate::job::{Job, Work};
 use crate::threads::off_thread;
 use crate::{scene, spec};
@@ -108,12 +108,34 @@ impl Done {
             ("queries".into(), self.counts.queries as f64),
             ("misses".into(), self.counts.misses as f64),
             ("reused".into(), self.counts.reused as f64),
+            ("samples".into(), self.counts.samples as f64),
             ("bytes.inserted".into(), inserted as f64),
             ("bytes.subscribed".into(), subscribed as f64),
             ("bytes.tiles".into(), tiles as f64),
         ];
-        all.into_iter().filter(|(_, value)| *value != 0.0).map(|(name, value)| v1::Count { name, value }).collect()
+        let all = all.into_iter().chain(judged(&self.counts));
+        all.filter(|(_, value)| *value != 0.0).map(|(name, value)| v1::Count { name, value }).collect()
     }
+}
+
+/// What finished pixels add up to, under names of their own.
+fn judged(counts: &Counts) -> impl Iterator<Item = (String, f64)> {
+    [("surfaces", counts.surfaces), ("lights", counts.lights)].into_iter().flat_map(|(of, sums)| {
+        let Sums { pixels, radiance, sampling, noise_squared, .. } = sums;
+        let named =
+            [("pixels", pixels as f64), ("radiance", radiance), ("sampling", sampling), ("noise", noise_squared)];
+        named.map(|(what, value)| (format!("{of}.{what}"), value))
+    })
+}
+
+/// The sums that the counts of a whole frame hold.
+pub fn sums(count: impl Fn(&str) -> f64) -> Counts {
+    let of = |of: &str| {
+        let value = |what: &str| count(&format!("{of}.{what}"));
+        let (pixels, radiance) = (value("pixels") as u64, value("radiance"));
+        Sums { pixels, radiance, sampling: value("sampling"), noise_squared: value("noise"), ..Sums::default() }
+    };
+    Counts { surfaces: of("surfaces"), lights: of("lights"), ..Counts::default() }
 }
 
 /// Little endian float32.

@@ -39,6 +39,8 @@ pub struct Tracer<'a> {
     pub bounces: u32,
     /// Whether diffuse light may be left to records: then beyond the last bounce there is none to look for by chance.
     pub cached: bool,
+    /// Shadow rays of each point the camera sees: what else it takes to find such a point is paid once for all of them.
+    pub looks: u32,
     /// Where no record covers what the camera sees, gather there and then with these cells; `None`: follow the path.
     pub regather: Option<&'a Strata>,
 }
@@ -66,6 +68,8 @@ pub struct Seen {
     pub direct: Rgb,
     /// Light with at least one bounce, and gathered light.
     pub indirect: Rgb,
+    /// Of the direct light, what shines straight into the ray.
+    pub emission: Rgb,
     /// Irradiance records gave at the first surface, W/m².
     pub irradiance: Rgb,
     /// How many records gave it.
@@ -97,6 +101,9 @@ impl Tracer<'_> {
                 None => self.beyond(direction, chance),
             };
             seen.add(throughput * emitted, depth <= first + 1 && first == 1);
+            if depth == first {
+                seen.emission = emitted;
+            }
             let Some(at) = meeting else { break };
             if depth == first {
                 seen.distance = at.distance;
@@ -118,7 +125,14 @@ impl Tracer<'_> {
                 }
                 None => Part::All,
             };
-            let lamps = self.lamps(&at, &bsdf, outgoing, part, [four[0], four[1], four[2]], counts);
+            let mut lamps = self.lamps(&at, &bsdf, outgoing, part, [four[0], four[1], four[2]], counts);
+            if depth == 1 && self.looks > 1 {
+                for _ in 1..self.looks {
+                    let [u, v, w, _] = sampler.next4();
+                    lamps += self.lamps(&at, &bsdf, outgoing, part, [u, v, w], counts);
+                }
+                lamps /= self.looks as f32;
+            }
             seen.add(throughput * lamps, depth == 1);
             let next = sampler.next4();
             let Some(scatter) = bsdf.sample(outgoing, part, [next[0], next[1], next[2]]) else { break };
