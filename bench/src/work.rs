@@ -83,6 +83,7 @@ pub fn spec(width: u32, height: u32, gather: u32) -> v1::FrameSpec {
         bounces: 2,
         seed: 0,
         levels: 2,
+        effort: None,
     }
 }
 

@@ -319,6 +319,7 @@ fn spec() -> v1::FrameSpec {
         bounces: 0,
         seed: 0,
         levels: 1,
+        effort: None,
     }
 }
 

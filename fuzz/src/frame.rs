@@ -73,6 +73,7 @@ pub fn spec() -> v1::FrameSpec {
         bounces: 1,
         seed: 0,
         levels: 1,
+        effort: None,
     }
 }
 

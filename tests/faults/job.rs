@@ -59,6 +59,7 @@ pub fn view(number: u32, tiles: u32, levels: u32) -> v1::FrameSpec {
         bounces: levels,
         seed: 0,
         levels,
+        effort: None,
     }
 }
 

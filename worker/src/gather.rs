@@ -5,6 +5,8 @@ use cache_core::hemisphere::{Estimate, Strata};
 use cache_core::id::{Origin, Random};
 use cache_core::math::Frame;
 use cache_core::{Cached, Irradiance, Namespace, RecordId};
+use std::f32::consts::SQRT_2;
+
 use glam::{Vec2, Vec3};
 
 use crate::frame::Counts;
@@ -90,7 +92,7 @@ impl Gather<'_> {
                 let first = estimate(&ladder[0]);
                 let have = ladder[0].rays() as f32;
                 let deviation = first.noise * have.sqrt() * std::f32::consts::FRAC_1_PI * site.reflectance;
-                match ladder.iter().rev().find(|s| s.rays() as f32 * 1.2 <= per_deviation * deviation) {
+                match ladder.iter().rev().find(|s| s.rays() as f32 <= per_deviation * deviation * SQRT_2) {
                     Some(strata) => estimate(strata).united(strata.rays() as f32, &first, have),
                     None => first,
                 }

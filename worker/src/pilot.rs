@@ -10,7 +10,7 @@ use cache_core::hemisphere::Strata;
 use cache_core::id::Random;
 use cache_core::rounds::{RANKS, rank};
 
-use crate::frame::{Counts, Frame, Levels};
+use crate::frame::{Counts, Frame, Levels, Sums};
 use crate::gather::{Gather, Rays};
 use crate::pixel::{Pixel, SPREAD};
 use crate::settings::{Effort, Settings};
@@ -46,7 +46,7 @@ const SHARES: [f64; 3] = [0.4, 0.35, 0.25];
 const WELL_SPREAD: f64 = 0.7;
 
 /// A record's noise over that of an answer, which is the mean of several records.
-const RECORDS_AT_ONCE: f64 = 1.7;
+const RECORDS_AT_ONCE: f64 = 1.3;
 
 /// Bounds of what may be chosen.
 const A_RANGE: (f64, f64) = (0.2, 0.8);
@@ -171,16 +171,23 @@ fn look(frame: &Frame) -> Seen {
     let mut seen = Seen { rays_of_fill: rays(&filling), ..Seen::default() };
     let tracer = frame.looking(&levels);
     let pixels = || (0..settings.height).flat_map(|y| (0..settings.width).map(move |x| [x, y]));
+    // Where a sample finds no record it goes on as a path and scatters far more than it will in the whole picture.
+    let mut covered = Counts::default();
     for [x, y] in pixels().filter(|[x, y]| rank(*x, *y) < ranks) {
-        let mut pixel = Pixel::new(settings, x, y);
-        pixel.sample(0..SPP, &tracer, settings, &mut seen.counts);
-        seen.counts.finish(&pixel);
+        let (mut pixel, mut counts) = (Pixel::new(settings, x, y), Counts::default());
+        pixel.sample(0..SPP, &tracer, settings, &mut counts);
+        counts.finish(&pixel);
+        seen.counts.add(&counts);
+        if counts.misses == 0 {
+            covered.add(&counts);
+        }
     }
-    let sums = seen.counts.judged();
-    let count = sums.pixels.max(1) as f64;
+    let mean = |sum: f64, sums: &Sums| sum / sums.pixels.max(1) as f64;
+    let (all, of) = (seen.counts.judged(), covered.judged());
     // A look into the cache takes about as long as a ray.
-    seen.rays_a_sample = (rays(&seen.counts) + seen.counts.queries as f64) / seen.counts.samples.max(1) as f64;
-    (seen.radiance, seen.deviation, seen.noise) = (sums.radiance / count, sums.deviation / count, sums.noise / count);
+    seen.rays_a_sample = (rays(&covered) + covered.queries as f64) / covered.samples.max(1) as f64;
+    seen.radiance = mean(all.radiance, &all);
+    (seen.deviation, seen.noise) = (mean(of.deviation, &of), mean(of.noise, &of));
     seen.counts.add(&filling);
     if !levels.is_empty() {
         seen.interpolation = probe(frame, &levels, &mut seen.counts);

@@ -45,6 +45,7 @@ fn label(namespace: Namespace, draft_of: Option<Namespace>) -> v1::Entry {
             method: "irradiance".into(),
             a: 0.3,
             rays: 2048,
+            rays_by_deviation: 0.0,
             bounces: u32::MAX,
             seed: u64::MAX,
             owner: String::new(),
