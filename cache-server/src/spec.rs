@@ -49,7 +49,7 @@ impl Job {
                 return Err(Refusal::field("a", format!("is {}, expected more than 0 and at most 10", spec.a)));
             }
         }
-        if let Some(v1::Effort { rays, samples }) = spec.effort
+        if let Some(v1::Effort { rays, samples, .. }) = spec.effort
             && !(rays > 0.0 && rays.is_finite() && samples > 0.0 && samples.is_finite())
         {
             return Err(Refusal::field("effort", format!("is {rays} and {samples}, expected both to be more than 0")));

@@ -44,9 +44,6 @@ const DEEPER_RAYS: f32 = 0.5;
 /// The same for gathers that trace as many rays as light varies.
 const DEEPER_EFFORT: f32 = 0.25;
 
-/// Rays by which such a gather finds out how much light varies.
-const FIRST_RAYS: u32 = 32;
-
 /// Shadow rays of each sample of a pixel, where samples are as many as light varies.
 const LOOKS: u32 = 4;
 
@@ -169,9 +166,10 @@ impl Frame {
         let namespace = settings.namespace(&world.scene.hash);
         let lights = Lights::new(&world, settings.method != Method::Path);
         let strata = [1.0, DEEPER_RAYS, MISSED_RAYS].map(|f| Strata::new((settings.rays as f32 * f) as u32));
-        let most = if settings.effort.is_some() { settings.rays } else { 0 };
-        let ladder = (0..).map(|i| FIRST_RAYS << i).take_while(|rays| *rays <= most.max(FIRST_RAYS)).map(Strata::new);
-        let ladder = ladder.collect();
+        let ladder = settings.effort.map_or_else(Vec::new, |effort| {
+            let rungs = std::iter::successors(Some(effort.least_rays), |rays| rays.checked_mul(2));
+            rungs.take_while(|rays| *rays <= settings.rays.max(effort.least_rays)).map(Strata::new).collect()
+        });
         Self { world, lights, settings, namespace, strata, ladder }
     }
 

@@ -48,6 +48,13 @@ const WELL_SPREAD: f64 = 0.7;
 /// A record's noise over that of an answer, which is the mean of several records.
 const RECORDS_AT_ONCE: f64 = 1.3;
 
+/// A gather traces at least an average one's rays divided by this.
+const LEAST: f64 = 4.0;
+const LEAST_RANGE: (u32, u32) = (32, 2048);
+
+/// Time a look into the cache takes, in rays.
+const RAYS_A_QUERY: f64 = 8.0;
+
 /// Bounds of what may be chosen.
 const A_RANGE: (f64, f64) = (0.2, 0.8);
 const RAYS_MOST: u32 = 16384;
@@ -115,7 +122,10 @@ pub fn choose(frame: Frame, error: f32) -> (Frame, Forecast) {
         interpolation: interpolation.sqrt() * (a / f64::from(A)).powi(2),
     };
     let positive = |effort: f64| (effort as f32).clamp(f32::MIN_POSITIVE, f32::MAX);
-    let effort = Effort { rays: positive(rays), samples: positive(samples) };
+    // The rays an average gather will trace.
+    let average = rays * seen.noise * f64::from(few).sqrt() * RECORDS_AT_ONCE;
+    let least_rays = ((average / LEAST) as u32).clamp(LEAST_RANGE.0, LEAST_RANGE.1).next_power_of_two();
+    let effort = Effort { rays: positive(rays), least_rays, samples: positive(samples) };
     let chosen = Settings { a: a as f32, rays: RAYS_MOST, spp: SPP_MOST, effort: Some(effort), ..asked };
     let forecast = Forecast { radiance: seen.radiance, errors, counts: seen.counts };
     (frame.with(chosen), forecast)
@@ -184,8 +194,7 @@ fn look(frame: &Frame) -> Seen {
     }
     let mean = |sum: f64, sums: &Sums| sum / sums.pixels.max(1) as f64;
     let (all, of) = (seen.counts.judged(), covered.judged());
-    // A look into the cache takes about as long as a ray.
-    seen.rays_a_sample = (rays(&covered) + covered.queries as f64) / covered.samples.max(1) as f64;
+    seen.rays_a_sample = (rays(&covered) + covered.queries as f64 * RAYS_A_QUERY) / covered.samples.max(1) as f64;
     seen.radiance = mean(all.radiance, &all);
     (seen.deviation, seen.noise) = (mean(of.deviation, &of), mean(of.noise, &of));
     seen.counts.add(&filling);

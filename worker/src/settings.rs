@@ -55,6 +55,8 @@ pub const ALL_BOUNCES: u32 = u32::MAX;
 pub struct Effort {
     /// Rays of a gather per W/(sr m²) by which reflected radiance would deviate with one ray; positive.
     pub rays: f32,
+    /// Rays at least, 4 to 1048576: so many find out how much light varies. Too few miss what is small and bright.
+    pub least_rays: u32,
     /// Samples of a pixel per W/(sr m²) of standard deviation of one; positive.
     pub samples: f32,
 }
@@ -148,6 +150,7 @@ impl Settings {
         hasher.update(&self.seed.to_le_bytes());
         if let Some(effort) = self.effort {
             hasher.update(&effort.rays.to_le_bytes());
+            hasher.update(&effort.least_rays.to_le_bytes());
         }
         Namespace(*hasher.finalize().as_bytes())
     }

@@ -37,7 +37,7 @@ fn written(settings: &Settings, levels: u32, namespace: &Namespace, path: &str, 
         bounces: settings.bounces,
         seed: settings.seed,
         levels,
-        effort: settings.effort.map(|Effort { rays, samples }| v1::Effort { rays, samples }),
+        effort: settings.effort.map(|Effort { rays, least_rays, samples }| v1::Effort { rays, samples, least_rays }),
     }
 }
 
@@ -69,7 +69,7 @@ pub fn settings(spec: &v1::FrameSpec) -> Result<Settings, String> {
         rays: spec.rays,
         bounces: spec.bounces,
         seed: spec.seed,
-        effort: spec.effort.map(|v1::Effort { rays, samples }| Effort { rays, samples }),
+        effort: spec.effort.map(|v1::Effort { rays, samples, least_rays }| Effort { rays, least_rays, samples }),
         details: Details::default(),
     };
     check(&settings)?;
@@ -100,6 +100,9 @@ pub fn check(settings: &Settings) -> Result<(), String> {
             return Err(format!("{name} is {value}, expected more than 0"));
         }
     }
+    if let Some(effort) = settings.effort {
+        range(effort.least_rays, 4, 1 << 20, "effort.least_rays")?;
+    }
     Ok(())
 }
 
@@ -124,7 +127,7 @@ pub(crate) mod tests {
             rays: 64,
             bounces: ALL_BOUNCES,
             seed: u64::MAX,
-            effort: Some(Effort { rays: 3.5, samples: 0.1 }),
+            effort: Some(Effort { rays: 3.5, least_rays: 32, samples: 0.1 }),
             details: Details::default(),
         }
     }
