@@ -87,7 +87,6 @@ impl World {
 
     /// Whether something lies between two points that are already off their surfaces.
     pub fn hidden(&self, from: Vec3, to: Vec3) -> bool {
-        // By a unit direction: the tree takes components near 1e-7 for zero, which in a tiny scene would be all of them.
         let way = to - from;
         let length = way.length();
         length > 0.0 && self.bvh.occluded(from, way / length, length)
