@@ -10,17 +10,13 @@ use glam::Vec3;
 /// adds 3. So much larger, boxes hold every hit. A rounding is 2^-24.
 const SLACK: f32 = 16.0 / (1 << 24) as f32;
 
-/// Components of the direction count as at least this fraction of its largest: over the length of any scene the
-/// difference is far below [`SLACK`], and reciprocals stay finite.
-const LEAST: f32 = 1.0 / (1u64 << 40) as f32;
-
 /// A ray as boxes and triangles ask for it.
 pub struct Ray {
     /// For each axis, which of a box's planes the ray meets first: 0 the low one, 1 the high one.
     pub first: [usize; 3],
     /// Origins towards the near and the far planes: moved so that boxes are wider by the slack.
     pub origins: [[f32; 3]; 2],
-    /// 1 / direction.
+    /// 1 / direction; infinite along planes, and where a box's plane holds the origin exactly, NaN counts as met.
     pub inverse: [f32; 3],
     /// x, y and z of the turned ray.
     pub axes: [usize; 3],
@@ -42,7 +38,6 @@ impl Ray {
         let shear = [direction[x] / direction[z], direction[y] / direction[z], 1.0 / direction[z]];
         let farthest = (bounds[0] - origin).abs().max((bounds[1] - origin).abs()).max_element();
         let slack = farthest * SLACK;
-        let least = direction[z].abs() * LEAST;
         let mut ray = Self {
             first: [0; 3],
             origins: [[0.0; 3]; 2],
@@ -54,11 +49,11 @@ impl Ray {
         for axis in 0..3 {
             let (o, d) = (origin[axis], direction[axis]);
             let wider = [(o + slack).next_up(), (o - slack).next_down()];
-            let backwards = usize::from(d < 0.0);
+            let backwards = usize::from(d.is_sign_negative());
             ray.first[axis] = backwards;
             ray.origins[0][axis] = wider[backwards];
             ray.origins[1][axis] = wider[1 - backwards];
-            ray.inverse[axis] = 1.0 / d.abs().max(least).copysign(if d < 0.0 { -1.0 } else { 1.0 });
+            ray.inverse[axis] = 1.0 / d;
         }
         ray
     }

@@ -22,7 +22,8 @@ fn grid_soup() -> impl Strategy<Value = Vec<Triangle>> {
 /// Directions of any length, along axes and almost along them.
 fn direction() -> impl Strategy<Value = Vec3> {
     let component = (-1f32..1.0, prop_oneof![Just(0), Just(1), 2i32..40]).prop_map(|(x, small)| match small {
-        0 => 0.0,
+        // Of either sign.
+        0 => x * 0.0,
         k => x * 0.5f32.powi(k - 1),
     });
     (prop::array::uniform3(component), -20i32..20)
@@ -74,6 +75,9 @@ proptest! {
         for bvh in both(&soup) {
             prop_assert_eq!(bvh.closest(origin, direction, f32::INFINITY), nearest);
             prop_assert_eq!(bvh.occluded(origin, direction, f32::INFINITY), nearest.is_some());
+            // However short the direction.
+            let far = nearest.map(|hit| Hit { t: hit.t * 2f32.powi(40), ..hit });
+            prop_assert_eq!(bvh.closest(origin, direction * 2f32.powi(-40), f32::INFINITY), far);
         }
     }
 
