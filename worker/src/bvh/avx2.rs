@@ -5,7 +5,7 @@ use std::arch::x86_64::*;
 
 use super::portable::on_edge;
 use super::ray::Ray;
-use super::traverse::{self, Lanes, Met};
+use super::traverse::{self, Entry, Lanes, Met};
 use super::{Hit, Node, Tree, WIDTH};
 
 /// Proof that this machine has AVX2: nothing else makes one but [`Self::detect`].
@@ -19,23 +19,23 @@ impl Avx2 {
     }
 
     /// See [`super::Bvh::closest`].
-    pub fn closest(self, tree: &Tree, ray: &Ray, t_max: f32) -> Option<Hit> {
+    pub fn closest(self, tree: &Tree, ray: &Ray, t_max: f32, stack: &mut [Entry]) -> Option<Hit> {
         #[target_feature(enable = "avx2")]
-        fn closest(lanes: Avx2, tree: &Tree, ray: &Ray, t_max: f32) -> Option<Hit> {
-            traverse::closest(tree, ray, t_max, lanes)
+        fn closest(lanes: Avx2, tree: &Tree, ray: &Ray, t_max: f32, stack: &mut [Entry]) -> Option<Hit> {
+            traverse::closest(tree, ray, t_max, stack, lanes)
         }
         // SAFETY: `self` proves that there is AVX2.
-        unsafe { closest(self, tree, ray, t_max) }
+        unsafe { closest(self, tree, ray, t_max, stack) }
     }
 
     /// See [`super::Bvh::occluded`].
-    pub fn occluded(self, tree: &Tree, ray: &Ray, t_max: f32) -> bool {
+    pub fn occluded(self, tree: &Tree, ray: &Ray, t_max: f32, stack: &mut [Entry]) -> bool {
         #[target_feature(enable = "avx2")]
-        fn occluded(lanes: Avx2, tree: &Tree, ray: &Ray, t_max: f32) -> bool {
-            traverse::occluded(tree, ray, t_max, lanes)
+        fn occluded(lanes: Avx2, tree: &Tree, ray: &Ray, t_max: f32, stack: &mut [Entry]) -> bool {
+            traverse::occluded(tree, ray, t_max, stack, lanes)
         }
         // SAFETY: `self` proves that there is AVX2.
-        unsafe { occluded(self, tree, ray, t_max) }
+        unsafe { occluded(self, tree, ray, t_max, stack) }
     }
 }
 

@@ -20,6 +20,8 @@ mod ray;
 mod tests;
 mod traverse;
 
+use std::cell::RefCell;
+
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 
@@ -27,6 +29,7 @@ use crate::scene::Triangle;
 use huge::Huge;
 use portable::Portable;
 use ray::Ray;
+use traverse::Entry;
 
 /// Children of a node and triangles of a leaf, at most.
 const WIDTH: usize = 8;
@@ -80,21 +83,21 @@ impl Bvh {
     /// The nearest hit with 0 < t < `t_max`; rays meet both faces. The direction is finite and not zero.
     pub fn closest(&self, origin: Vec3, direction: Vec3, t_max: f32) -> Option<Hit> {
         let ray = Ray::new(origin, direction, &self.tree.bounds);
-        match self.kernel {
-            Kernel::Portable => traverse::closest(&self.tree, &ray, t_max, Portable),
+        self.tree.with_stack(|stack| match self.kernel {
+            Kernel::Portable => traverse::closest(&self.tree, &ray, t_max, stack, Portable),
             #[cfg(target_arch = "x86_64")]
-            Kernel::Avx2(avx2) => avx2.closest(&self.tree, &ray, t_max),
-        }
+            Kernel::Avx2(avx2) => avx2.closest(&self.tree, &ray, t_max, stack),
+        })
     }
 
     /// Whether anything lies between 0 and `t_max`, in lengths of `direction`.
     pub fn occluded(&self, origin: Vec3, direction: Vec3, t_max: f32) -> bool {
         let ray = Ray::new(origin, direction, &self.tree.bounds);
-        match self.kernel {
-            Kernel::Portable => traverse::occluded(&self.tree, &ray, t_max, Portable),
+        self.tree.with_stack(|stack| match self.kernel {
+            Kernel::Portable => traverse::occluded(&self.tree, &ray, t_max, stack, Portable),
             #[cfg(target_arch = "x86_64")]
-            Kernel::Avx2(avx2) => avx2.occluded(&self.tree, &ray, t_max),
-        }
+            Kernel::Avx2(avx2) => avx2.occluded(&self.tree, &ray, t_max, stack),
+        })
     }
 
     /// Memory of the tree and its copy of the triangles, bytes.
@@ -113,6 +116,21 @@ struct Tree {
     root: Child,
     /// Nodes on the longest way down.
     depth: usize,
+}
+
+impl Tree {
+    /// Lends room for all that a ray may still have to visit: this thread's, used again and again.
+    #[inline]
+    fn with_stack<R>(&self, visit: impl FnOnce(&mut [Entry]) -> R) -> R {
+        thread_local!(static STACK: RefCell<Vec<Entry>> = const { RefCell::new(Vec::new()) });
+        STACK.with_borrow_mut(|stack| {
+            let room = self.depth * (WIDTH - 1) + 1;
+            if stack.len() < room {
+                stack.resize(room, 0);
+            }
+            visit(stack)
+        })
+    }
 }
 
 /// A node or a leaf: the highest bit tells which; of a leaf three bits hold the number of its triangles less one, the

@@ -169,13 +169,13 @@ fn small_components_of_a_direction_count() {
     }
 }
 
-/// Ever smaller triangles towards a point make a tree deeper than the traversal's stack on the stack.
+/// Ever smaller triangles towards a point make a deep tree.
 #[test]
 fn deep_trees_are_traced() {
     let at = |k: i32, x: f32, y: f32| Vec3::new(x, y, 1.0) * 1.7f32.powi(k);
     let soup: Vec<_> = (-150..150).map(|k| triangle([at(k, -1.0, -1.0), at(k, 1.0, -1.0), at(k, 0.0, 1.0)])).collect();
     for bvh in both(&soup) {
-        assert!(bvh.tree.depth > 16, "{}", bvh.tree.depth);
+        assert!(bvh.tree.depth > 20, "{}", bvh.tree.depth);
         let from = Vec3::new(0.0, 0.0, -1.0);
         assert_eq!(bvh.closest(from, Vec3::Z, f32::INFINITY), nearest(&soup, from, Vec3::Z));
         assert_eq!(bvh.closest(Vec3::ZERO, Vec3::Z, f32::INFINITY), nearest(&soup, Vec3::ZERO, Vec3::Z));

@@ -27,42 +27,18 @@ pub struct Met {
     pub det: [f32; WIDTH],
 }
 
-/// Levels of a tree that need no memory from the heap.
-const SHALLOW: usize = 16;
-
 /// A child still to visit: how far away its box is, as bits, and what it is. Nearer ones are less.
-type Entry = u64;
+pub type Entry = u64;
 
 #[inline(always)]
 fn entry(near: f32, child: Child) -> Entry {
     u64::from(near.to_bits()) << 32 | u64::from(child.0)
 }
 
-/// Room for what is still to visit.
-struct Stack {
-    shallow: [Entry; SHALLOW * (WIDTH - 1) + 1],
-    deep: Vec<Entry>,
-}
-
-impl Stack {
-    #[inline(always)]
-    fn new(tree: &Tree) -> Self {
-        let deep = if tree.depth > SHALLOW { vec![0; tree.depth * (WIDTH - 1) + 1] } else { Vec::new() };
-        Self { shallow: [0; SHALLOW * (WIDTH - 1) + 1], deep }
-    }
-
-    #[inline(always)]
-    fn entries(&mut self) -> &mut [Entry] {
-        if self.deep.is_empty() { &mut self.shallow } else { &mut self.deep }
-    }
-}
-
 /// See [`super::Bvh::closest`]. Nearer boxes first.
 #[inline(always)]
-pub fn closest(tree: &Tree, ray: &Ray, t_max: f32, lanes: impl Lanes) -> Option<Hit> {
+pub fn closest(tree: &Tree, ray: &Ray, t_max: f32, stack: &mut [Entry], lanes: impl Lanes) -> Option<Hit> {
     let (nodes, leaves) = (&tree.nodes[..], &tree.leaves[..]);
-    let mut stack = Stack::new(tree);
-    let stack = stack.entries();
     let mut best: Option<Hit> = None;
     let (mut t_max, mut triangle) = (t_max, 0);
     let mut top = 0;
@@ -115,10 +91,8 @@ pub fn closest(tree: &Tree, ray: &Ray, t_max: f32, lanes: impl Lanes) -> Option<
 
 /// See [`super::Bvh::occluded`]. Leaves first.
 #[inline(always)]
-pub fn occluded(tree: &Tree, ray: &Ray, t_max: f32, lanes: impl Lanes) -> bool {
+pub fn occluded(tree: &Tree, ray: &Ray, t_max: f32, stack: &mut [Entry], lanes: impl Lanes) -> bool {
     let (nodes, leaves) = (&tree.nodes[..], &tree.leaves[..]);
-    let mut stack = Stack::new(tree);
-    let stack = stack.entries();
     let mut top = 0;
     let mut child = tree.root;
     loop {
