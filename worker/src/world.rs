@@ -5,6 +5,7 @@ use glam::Vec3;
 
 use crate::bsdf::Bsdf;
 use crate::bvh::Bvh;
+use crate::lights::Place;
 use crate::scene::{Rgb, Scene, Triangle};
 
 /// Distance a new ray starts from its surface, as a fraction of the largest coordinate there: some sixteen roundings,
@@ -132,6 +133,11 @@ impl Meeting {
     /// Where a ray that leaves along `direction` starts: just off the surface, on the side it leaves to.
     pub fn leave(&self, direction: Vec3) -> Vec3 {
         self.position + self.facet * self.lift.copysign(direction.dot(self.facet))
+    }
+
+    /// Where light is looked for.
+    pub fn place(&self) -> Place {
+        Place { position: self.position, normal: self.normal() }
     }
 
     /// Unit shading normal.
