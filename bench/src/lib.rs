@@ -1,9 +1,11 @@
-//! The charts: speed against accuracy, the service against the bare stream under it, farms that are simulated.
+//! The charts: speed against accuracy, rays, the service against the bare stream under it, farms that are simulated.
 //!
 //! - [`judge`]: scenes with references, and the measure pictures of them are held to; the tests use it too.
 //! - [`pictures`]: speed against accuracy.
 //! - [`asked`]: whether a picture is as far from the truth as was asked for.
 //! - [`details`]: what each practical detail of irradiance caching buys.
+//! - [`soups`]: rooms of many triangles, and rays in them.
+//! - [`rays`]: rays a second, against Embree.
 //! - [`records`]: records made up, of real size.
 //! - [`bare`]: the cache service with nothing behind it.
 //! - [`host`]: a server in a process of its own.
@@ -16,6 +18,9 @@ pub mod asked;
 pub mod details;
 pub mod judge;
 pub mod pictures;
+
+pub mod rays;
+pub mod soups;
 
 pub mod bare;
 pub mod host;

@@ -15,7 +15,7 @@ use glam::{Vec2, Vec3};
 
 use crate::bsdf::{Bsdf, Part};
 use crate::frame::{Counts, Levels};
-use crate::lights::Lights;
+use crate::lights::{Lights, Place};
 use crate::math::Frame;
 use crate::sampler::Sampler;
 use crate::scene::Rgb;
@@ -57,7 +57,7 @@ pub enum Chance {
         /// Density of the ray by solid angle, 1/sr.
         density: f32,
         /// Where lamps were looked for: their chances there count, not those where the ray starts, just off the surface.
-        from: Vec3,
+        from: Place,
     },
 }
 
@@ -149,7 +149,7 @@ impl Tracer<'_> {
                 throughput /= survival;
             }
             chance = match scatter.pdf {
-                density if density.is_finite() => Chance::Weighed { density, from: at.position },
+                density if density.is_finite() => Chance::Weighed { density, from: at.place() },
                 _ => Chance::All,
             };
             (origin, direction) = (at.leave(incoming), incoming);
@@ -216,7 +216,7 @@ impl Tracer<'_> {
 
     /// Reflected light of one lamp looked for by a shadow ray. `part` is what will be followed by chance as well.
     fn lamps(&self, at: &Meeting, bsdf: &Bsdf, outgoing: Vec3, part: Part, u: [f32; 3], counts: &mut Counts) -> Rgb {
-        let Some(arrival) = self.lights.sample(self.world, at.position, u) else { return Rgb::ZERO };
+        let Some(arrival) = self.lights.sample(self.world, &at.place(), u) else { return Rgb::ZERO };
         let incoming = at.frame.to_local(arrival.direction);
         if incoming.z <= 0.0 || arrival.direction.dot(at.facet) <= 0.0 {
             return Rgb::ZERO;
@@ -257,7 +257,7 @@ impl Tracer<'_> {
                 }
             }
             Chance::Weighed { density, from } => {
-                let looked = self.lights.pdf_triangle(self.world, at.triangle, from, direction, at.distance);
+                let looked = self.lights.pdf_triangle(self.world, at.triangle, &from, direction, at.distance);
                 emission * heuristic(density, looked)
             }
         }
@@ -268,7 +268,7 @@ impl Tracer<'_> {
             .beyond(self.world, direction)
             .map(|(radiance, light)| match (chance, light) {
                 (Chance::Weighed { density, from }, Some(light)) => {
-                    radiance * heuristic(density, self.lights.pdf_distant(self.world, from, light))
+                    radiance * heuristic(density, self.lights.pdf_distant(&from, light))
                 }
                 (Chance::Gathered, Some(_)) => Rgb::ZERO,
                 _ => radiance,

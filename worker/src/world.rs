@@ -5,6 +5,7 @@ use glam::Vec3;
 
 use crate::bsdf::Bsdf;
 use crate::bvh::Bvh;
+use crate::lights::Place;
 use crate::scene::{Rgb, Scene, Triangle};
 
 /// Distance a new ray starts from its surface, as a fraction of the largest coordinate there: some sixteen roundings,
@@ -87,7 +88,6 @@ impl World {
 
     /// Whether something lies between two points that are already off their surfaces.
     pub fn hidden(&self, from: Vec3, to: Vec3) -> bool {
-        // By a unit direction: the tree takes components near 1e-7 for zero, which in a tiny scene would be all of them.
         let way = to - from;
         let length = way.length();
         length > 0.0 && self.bvh.occluded(from, way / length, length)
@@ -133,6 +133,11 @@ impl Meeting {
     /// Where a ray that leaves along `direction` starts: just off the surface, on the side it leaves to.
     pub fn leave(&self, direction: Vec3) -> Vec3 {
         self.position + self.facet * self.lift.copysign(direction.dot(self.facet))
+    }
+
+    /// Where light is looked for.
+    pub fn place(&self) -> Place {
+        Place { position: self.position, normal: self.normal() }
     }
 
     /// Unit shading normal.

@@ -149,6 +149,14 @@ pub struct Spot {
     pub cos_outer: f32,
 }
 
+impl Spot {
+    /// What is left of its intensity where the cosine with its axis is this, 0 to 1 (KHR_lights_punctual).
+    pub fn falloff(&self, cosine: f32) -> f32 {
+        let t = ((cosine - self.cos_outer) / (self.cos_inner - self.cos_outer).max(1e-4)).clamp(0.0, 1.0);
+        t * t
+    }
+}
+
 /// Light from infinitely far away.
 #[derive(Clone, Copy, Debug)]
 pub struct DistantLight {

@@ -1,9 +1,13 @@
-//! Where light comes from, and how shadow rays find it: one light per request, chosen by
-//! what it may give there where there are few, else by its power.
+//! Where light comes from, and how shadow rays find it: one light per request, chosen by what it may give there
+//! ([`tree`]).
 //!
 //! Light is *sampled* (shadow rays look for it; rays that meet it by chance count only by multiple importance sampling)
 //! or *gathered* (only rays that meet it by chance count; a record of irradiance includes it). Which one makes no
 //! difference to a converged picture: small bright lights are found by looking, broad dim ones by chance.
+
+#[cfg(test)]
+mod tests;
+mod tree;
 
 use std::f32::consts::PI;
 
@@ -14,6 +18,9 @@ use crate::scene::{DistantLight, PointLight, Rgb};
 use crate::spherical::SphericalTriangle;
 use crate::world::{World, facet};
 
+pub use tree::Place;
+use tree::{Lamp, LightTree, Shines};
+
 /// A material whose light covers at least this much of all surface is gathered by methods that gather: a gather's rays
 /// meet it often, and shadow rays to so broad a light would be noisy.
 const BROAD: f32 = 0.125;
@@ -23,9 +30,9 @@ const BROAD_COSINE: f32 = 0.9;
 
 /// What shadow rays can ask.
 pub struct Lights {
+    /// Those of the tree, in its order, then those infinitely far away.
     lights: Vec<Light>,
-    /// Running sum of the probabilities; the last is 1.
-    cumulative: Vec<f32>,
+    tree: LightTree,
     /// For every triangle its light, or `NONE`.
     of_triangle: Vec<u32>,
     /// For every distant light its light, or `NONE`.
@@ -35,9 +42,6 @@ pub struct Lights {
 }
 
 const NONE: u32 = u32::MAX;
-
-/// Up to this many lights are weighed against each other wherever one is looked for; more are chosen by power alone.
-const FEW: usize = 16;
 
 #[derive(Clone, Copy)]
 enum Light {
@@ -64,54 +68,49 @@ impl Lights {
     pub fn new(world: &World, gather_broad: bool) -> Self {
         let scene = &world.scene;
         let sampled = sampled_materials(world, gather_broad);
-        let mut lights = Vec::new();
-        let mut powers = Vec::new();
+        let (mut near, mut lamps, mut far) = (Vec::new(), Vec::new(), Vec::new());
         let (mut of_triangle, mut of_distant) = (vec![NONE; scene.triangles.len()], vec![NONE; scene.distant.len()]);
         let mut gathered = false;
-        let mut add = |light, power: f32| {
-            lights.push(light);
-            powers.push(f64::from(power));
-            lights.len() as u32 - 1
-        };
         for (i, triangle) in scene.triangles.iter().enumerate() {
             let emission = scene.materials[triangle.material as usize].emission;
-            let power = luminance(emission) * PI * area(&triangle.positions);
+            let area = area(&triangle.positions);
+            let power = luminance(emission) * area;
             if power > 0.0 && sampled[triangle.material as usize] {
-                let area = area(&triangle.positions);
-                let light = Light::Triangle { index: i as u32, area, normal: facet(triangle), emission };
-                of_triangle[i] = add(light, power);
+                let normal = facet(triangle);
+                let middle = triangle.positions.into_iter().sum::<Vec3>() * (1.0 / 3.0);
+                let radius = triangle.positions.iter().map(|p| p.distance(middle)).fold(0.0, f32::max);
+                near.push(Light::Triangle { index: i as u32, area, normal, emission });
+                lamps.push(Lamp { middle, radius, power, area, shines: Shines::Front(normal) });
             } else if power > 0.0 {
                 gathered = true;
             }
         }
         for point in &scene.points {
-            add(Light::Point(*point), luminance(point.intensity) * 4.0 * PI);
+            let shines = point.spot.map_or(Shines::Round, Shines::Cone);
+            let power = luminance(point.intensity);
+            near.push(Light::Point(*point));
+            lamps.push(Lamp { middle: point.position, radius: 0.0, power, area: 0.0, shines });
         }
-        for (i, distant) in scene.distant.iter().enumerate() {
-            let disc = PI * world.radius * world.radius;
-            let broad = distant.cos_half_angle < BROAD_COSINE;
-            if distant.is_beam() {
-                add(Light::Distant(*distant), luminance(distant.strength) * disc);
-            } else if gather_broad && broad {
-                gathered = true;
-            } else {
-                let solid_angle = 2.0 * PI * (1.0 - distant.cos_half_angle);
-                of_distant[i] = add(Light::Distant(*distant), luminance(distant.strength) * solid_angle * disc);
+        let (tree, order) = LightTree::new(&lamps);
+        let mut lights: Vec<_> = order.iter().map(|&i| near[i as usize]).collect();
+        for (at, light) in lights.iter().enumerate() {
+            if let Light::Triangle { index, .. } = light {
+                of_triangle[*index as usize] = at as u32;
             }
         }
-        let total: f64 = powers.iter().sum();
-        let mut sum = 0.0;
-        let mut cumulative: Vec<f32> = powers
-            .iter()
-            .map(|p| {
-                sum += p;
-                (sum / total) as f32
-            })
-            .collect();
-        if let Some(last) = cumulative.last_mut() {
-            *last = 1.0;
+        for (i, distant) in scene.distant.iter().enumerate() {
+            let broad = distant.cos_half_angle < BROAD_COSINE;
+            if !distant.is_beam() && gather_broad && broad {
+                gathered = true;
+            } else {
+                if !distant.is_beam() {
+                    of_distant[i] = (lights.len() + far.len()) as u32;
+                }
+                far.push(Light::Distant(*distant));
+            }
         }
-        Self { lights, cumulative, of_triangle, of_distant, gathered }
+        lights.append(&mut far);
+        Self { lights, tree, of_triangle, of_distant, gathered }
     }
 
     /// Whether rays can meet light that no shadow ray looks for.
@@ -129,76 +128,65 @@ impl Lights {
         self.of_triangle[triangle as usize] != NONE
     }
 
-    /// Chooses a light by `u` in [0, 1), and tells the chance it had; `None` when none shines towards `from`.
-    fn choose(&self, world: &World, from: Vec3, u: f32) -> Option<(usize, f32)> {
-        if self.lights.len() > FEW {
-            let choice = self.cumulative.partition_point(|c| *c <= u).min(self.lights.len() - 1);
-            return Some((choice, self.power_chance(choice)));
+    /// Chooses a light by `u` in [0, 1), and tells the chance it had; `None` when none shines there.
+    fn choose(&self, place: &Place, u: f32) -> Option<(usize, f32)> {
+        let (near, total) = self.totals(place);
+        let share = near / total;
+        if u < share {
+            return self.tree.choose(place, u / share).map(|(light, chance)| (light, chance * share));
         }
-        let mut shares = [0.0; FEW];
-        let total = self.shares(world, from, &mut shares);
-        let mut rest = u * total;
+        let mut rest = u * total - near;
         let mut choice = None;
-        for (i, &share) in shares.iter().enumerate().filter(|(_, s)| **s > 0.0) {
-            choice = Some((i, share / total));
-            rest -= share;
-            if rest < 0.0 {
-                break;
+        for (at, light) in self.far() {
+            let share = far_share(light, place);
+            if share > 0.0 {
+                choice = Some((at, share / total));
+                rest -= share;
+                if rest < 0.0 {
+                    break;
+                }
             }
         }
         choice
     }
 
-    /// The chance of choosing a light from `from`.
-    fn chance(&self, world: &World, from: Vec3, light: u32) -> f32 {
-        if self.lights.len() > FEW {
-            return self.power_chance(light as usize);
+    /// The chance of choosing a light.
+    fn chance(&self, place: &Place, light: u32) -> f32 {
+        let (near, total) = self.totals(place);
+        let at = light as usize;
+        if total <= 0.0 {
+            0.0
+        } else if at < self.tree.len() {
+            self.tree.chance(place, at) * (near / total)
+        } else {
+            far_share(&self.lights[at], place) / total
         }
-        let mut shares = [0.0; FEW];
-        let total = self.shares(world, from, &mut shares);
-        if total > 0.0 { shares[light as usize] / total } else { 0.0 }
     }
 
-    fn power_chance(&self, light: usize) -> f32 {
-        let before = if light == 0 { 0.0 } else { self.cumulative[light - 1] };
-        self.cumulative[light] - before
+    /// Roughly the irradiance the tree's lights, and all, would give, unhidden.
+    fn totals(&self, place: &Place) -> (f32, f32) {
+        let near = self.tree.total(place);
+        (near, self.far().fold(near, |sum, (_, light)| sum + far_share(light, place)))
     }
 
-    /// Roughly the irradiance each of few lights would give a surface that faces it, unhidden; and their sum.
-    fn shares(&self, world: &World, from: Vec3, shares: &mut [f32; FEW]) -> f32 {
-        for (light, share) in self.lights.iter().zip(shares.iter_mut()) {
-            *share = match *light {
-                Light::Triangle { index, area, normal, emission } => {
-                    let [a, b, c] = world.scene.triangles[index as usize].positions;
-                    let offset = (a + b + c) * (1.0 / 3.0) - from;
-                    let (distance2, height) = (offset.length_squared(), -normal.dot(a - from));
-                    // Near a lamp its middle says little: no more than a hemisphere of it, no less than a twentieth.
-                    let cosine = (height / distance2.sqrt()).max(0.05);
-                    if height > 0.0 { luminance(emission) * area * cosine / (distance2 + area) } else { 0.0 }
-                }
-                Light::Point(point) => {
-                    luminance(point.intensity) / (point.position - from).length_squared().max(f32::MIN_POSITIVE)
-                }
-                Light::Distant(light) if light.is_beam() => luminance(light.strength),
-                Light::Distant(light) => luminance(light.strength) * 2.0 * PI * (1.0 - light.cos_half_angle),
-            };
-        }
-        shares.iter().sum()
+    fn far(&self) -> impl Iterator<Item = (usize, &Light)> {
+        self.lights.iter().enumerate().skip(self.tree.len())
     }
 
-    /// Density, by solid angle, of looking from `from` for the light of a triangle, where a ray from there along
+    /// Density, by solid angle, of looking from a place for the light of a triangle, where a ray from there along
     /// `direction` met it at `distance`; 0 for light that is not sampled.
-    pub fn pdf_triangle(&self, world: &World, triangle: u32, from: Vec3, direction: Vec3, distance: f32) -> f32 {
+    pub fn pdf_triangle(&self, world: &World, triangle: u32, place: &Place, direction: Vec3, distance: f32) -> f32 {
         let light = self.of_triangle[triangle as usize];
         if light == NONE {
             return 0.0;
         }
         let Light::Triangle { area, normal, .. } = self.lights[light as usize] else { return 0.0 };
-        let density = match SphericalTriangle::near(from, &world.scene.triangles[triangle as usize].positions) {
+        let density = match SphericalTriangle::near(place.position, &world.scene.triangles[triangle as usize].positions)
+        {
             Some(near) => 1.0 / near.solid_angle,
             None => distance * distance / (area * normal.dot(direction).abs()),
         };
-        self.chance(world, from, light) * density
+        self.chance(place, light) * density
     }
 
     /// What a ray that meets nothing sees: the radiance of each distant light in that direction, and its number where
@@ -210,15 +198,16 @@ impl Lights {
         all.filter(move |(d, _)| seen(d)).map(move |(d, &light)| (d.strength, sampled(light)))
     }
 
-    /// Density, by solid angle, of looking from `from` for the light of this number, one of those of [`Self::beyond`].
-    pub fn pdf_distant(&self, world: &World, from: Vec3, light: u32) -> f32 {
+    /// Density, by solid angle, of looking from a place for the light of this number, one of those of [`Self::beyond`].
+    pub fn pdf_distant(&self, place: &Place, light: u32) -> f32 {
         let Light::Distant(distant) = self.lights[light as usize] else { return 0.0 };
-        self.chance(world, from, light) / (2.0 * PI * (1.0 - distant.cos_half_angle))
+        self.chance(place, light) / (2.0 * PI * (1.0 - distant.cos_half_angle))
     }
 
-    /// Chooses a light and a point on it by `u` in [0, 1)³, as seen from `from`; `None` when it does not shine there.
-    pub fn sample(&self, world: &World, from: Vec3, u: [f32; 3]) -> Option<Arrival> {
-        let (choice, chance) = self.choose(world, from, u[0])?;
+    /// Chooses a light and a point on it by `u` in [0, 1)³, as seen from a place; `None` when it does not shine there.
+    pub fn sample(&self, world: &World, place: &Place, u: [f32; 3]) -> Option<Arrival> {
+        let from = place.position;
+        let (choice, chance) = self.choose(place, u[0])?;
         match self.lights[choice] {
             Light::Triangle { index, area, normal, emission } => {
                 let corners = &world.scene.triangles[index as usize].positions;
@@ -235,12 +224,7 @@ impl Lights {
             Light::Point(point) => {
                 let offset = point.position - from;
                 let (distance2, direction) = (offset.length_squared(), offset.try_normalize()?);
-                let falloff = point.spot.map_or(1.0, |spot| {
-                    let cosine = -direction.dot(spot.axis);
-                    let t = (cosine - spot.cos_outer) / (spot.cos_inner - spot.cos_outer).max(1e-4);
-                    let t = t.clamp(0.0, 1.0);
-                    t * t
-                });
+                let falloff = point.spot.map_or(1.0, |spot| spot.falloff(-direction.dot(spot.axis)));
                 let weight = point.intensity * (falloff / (distance2 * chance));
                 (falloff > 0.0).then_some(Arrival { direction, end: Some(point.position), weight, pdf: None })
             }
@@ -256,6 +240,17 @@ impl Lights {
                 Some(Arrival { direction, end: None, weight: light.strength / pdf, pdf: Some(pdf) })
             }
         }
+    }
+}
+
+/// Roughly the irradiance a light infinitely far away gives, unhidden; 0 only if it gives none.
+fn far_share(light: &Light, place: &Place) -> f32 {
+    let Light::Distant(light) = light else { return 0.0 };
+    let cosine = light.to_light.dot(place.normal);
+    match light.is_beam() {
+        true => luminance(light.strength) * cosine.max(0.0),
+        // Some of its disc may rise above the horizon.
+        false => luminance(light.strength) * 2.0 * PI * (1.0 - light.cos_half_angle) * cosine.max(0.05),
     }
 }
 
