@@ -12,6 +12,10 @@ pub fn record(data: &[u8]) {
     for bytes in data.chunks(Irradiance::BYTES).take(RECORDS_MAX) {
         let Ok(record) = Irradiance::decode(bytes) else { continue };
         assert_eq!(record.check(), Ok(()));
+        // Said once more, in other words than the check's.
+        assert!(bytes[16..].chunks(4).all(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]).is_finite()));
+        let far = record.position.to_array().into_iter().chain([record.radius_max]).map(|x| f64::from(x.abs()));
+        assert!(f64::from(record.radius) > 2e-10 * far.fold(0.0, f64::max), "{record:?}");
         let mut again = Vec::new();
         record.encode(&mut again);
         assert_eq!(again, bytes);
