@@ -28,8 +28,8 @@ const COMPLETE_BYTES_MAX: usize = 4 << 20;
 /// workers finish a step together (guided self-scheduling).
 const SHARES: u32 = 4;
 
-/// What a lease should take at least, as far as those done tell: a small part of that is spent on giving it out. No
-/// lease is more than an equal share for that.
+/// What a lease should take at least, as far as those done tell: a small part of that is spent on giving it out. Where
+/// a whole step is little work, some of many workers get none of it.
 const LEASE_LEAST: Duration = Duration::from_millis(10);
 
 /// Most reasons of workers that wait for the owner; more are dropped, the first ones say enough.
@@ -139,7 +139,7 @@ impl Frame {
         let fit = workers.saturating_sub(self.unfit.len() as u32).max(1);
         let round = self.round.as_mut()?;
         let pending = round.pending_tiles();
-        let least = round.tiles_in(LEASE_LEAST).min(pending / fit);
+        let least = round.tiles_in(LEASE_LEAST);
         let share = (pending / fit.saturating_mul(SHARES)).max(least).max(1);
         let tiles =
             (room > 0).then(|| round.grant(lease, worker.clone(), share.min(room), now, now + LEASE_TIME))??;
