@@ -340,7 +340,10 @@ impl Render<'_> {
     }
 
     fn decline(&mut self, declined: v1::FrameDeclined) -> Result<(), Failure> {
-        let v1::FrameDeclined { worker, reason } = declined;
+        let v1::FrameDeclined { worker, reason, for_all } = declined;
+        if for_all {
+            return Err(Failure::failed(reason));
+        }
         self.progress.note(&format!("warning: worker {worker} cannot take part: {reason}"));
         self.declined.insert(worker);
         self.check_workers(&reason)

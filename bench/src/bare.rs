@@ -1,6 +1,8 @@
 //! The cache service with nothing behind it: the same messages over the same transport, relayed and forgotten, or kept as they came.
 //! What the real one is measured against.
 
+use std::fs::File;
+use std::io::Write as _;
 use std::pin::Pin;
 use std::sync::Mutex;
 
@@ -27,13 +29,17 @@ pub struct Bare {
     prepared: Vec<RecordBatch>,
     /// What came, if that is to be kept.
     kept: Option<Mutex<Vec<RecordBatch>>>,
+    /// Where its bytes are written, one after another, if they are.
+    file: Option<Mutex<File>>,
     live: broadcast::Sender<RecordBatch>,
 }
 
 impl Bare {
-    /// A service with `prepared` batches to send, that keeps the messages it gets or forgets them.
-    pub fn new(prepared: Vec<RecordBatch>, keeps: bool) -> Self {
-        Self { prepared, kept: keeps.then(Mutex::default), live: broadcast::Sender::new(LAG) }
+    /// A service with `prepared` batches to send, that keeps the messages it gets or forgets them, and writes them to
+    /// a file if there is one.
+    pub fn new(prepared: Vec<RecordBatch>, keeps: bool, file: Option<File>) -> Self {
+        let (kept, file) = (keeps.then(Mutex::default), file.map(Mutex::new));
+        Self { prepared, kept, file, live: broadcast::Sender::new(LAG) }
     }
 }
 
@@ -49,6 +55,9 @@ impl Cache for Bare {
         while let Some(request) = batches.message().await? {
             let batch = request.batch.ok_or_else(|| Status::invalid_argument("no batch"))?;
             position += 1;
+            if let Some(file) = &self.file {
+                lock(file).write_all(&batch.records)?;
+            }
             if let Some(kept) = &self.kept {
                 lock(kept).push(batch.clone());
             }

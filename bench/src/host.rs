@@ -1,6 +1,7 @@
 //! A server in a process of its own, so that its CPU time and memory can be told from its clients'.
 
 use std::error::Error;
+use std::fs::File;
 use std::io::{BufRead as _, BufReader, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
@@ -28,6 +29,8 @@ pub enum Kind {
     Bare,
     /// Nothing, but the messages are kept in memory as they came.
     Keep,
+    /// Nothing, but the messages are kept in memory, and their bytes written to a file.
+    Write,
     /// The service, records in memory only.
     Memory,
     /// The service, records durable in the kernel's page cache.
@@ -145,9 +148,10 @@ pub fn serve(args: &HostArgs) -> Result<(), Box<dyn Error>> {
     let path = socket(&args.folder);
     let serving: std::pin::Pin<Box<dyn Future<Output = Result<(), String>> + Send>> = match journal(args)? {
         None => {
-            let keeps = args.kind == Kind::Keep;
+            let keeps = args.kind != Kind::Bare;
+            let file = (args.kind == Kind::Write).then(|| File::create(args.folder.join("bytes"))).transpose()?;
             let incoming = UnixListenerStream::new(UnixListener::bind(&path)?);
-            let bare = CacheServer::new(Bare::new(prepared, keeps)).max_decoding_message_size(CACHE_MESSAGE_MAX);
+            let bare = CacheServer::new(Bare::new(prepared, keeps, file)).max_decoding_message_size(CACHE_MESSAGE_MAX);
             let server = Server::builder()
                 .initial_stream_window_size(STREAM_WINDOW)
                 .initial_connection_window_size(CONNECTION_WINDOW)
@@ -179,7 +183,7 @@ fn journal(args: &HostArgs) -> Result<Option<Box<dyn Journal>>, Box<dyn Error>> 
     let disk =
         |sync| Disk::open(&args.folder.join("journal"), sync).map(|(disk, _)| Box::new(disk) as Box<dyn Journal>);
     Ok(match args.kind {
-        Kind::Bare | Kind::Keep => None,
+        Kind::Bare | Kind::Keep | Kind::Write => None,
         Kind::Memory => Some(Box::new(cache_server::journal::Nowhere)),
         Kind::Page => Some(disk(Sync::PageCache).map_err(|e| e.to_string())?),
         Kind::Device => Some(disk(Sync::Device).map_err(|e| e.to_string())?),

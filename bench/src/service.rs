@@ -33,9 +33,10 @@ const PING_EVERY: Duration = Duration::from_millis(4);
 /// The load of a busy farm, in another namespace: batches of 256, each such time.
 const LOAD_EVERY: Duration = Duration::from_millis(2);
 
-const KINDS: [(Kind, &str); 5] = [
+const KINDS: [(Kind, &str); 6] = [
     (Kind::Bare, "bare stream"),
     (Kind::Keep, "bare stream, bytes kept"),
+    (Kind::Write, "the same, and written"),
     (Kind::Memory, "in memory"),
     (Kind::Page, "durable in the page cache"),
     (Kind::Device, "durable on the device"),
@@ -130,7 +131,7 @@ async fn insert(
         let rate = median(samples, |s| s.rate);
         let (cpu, memory) = (median(samples, |s| s.cpu), median(samples, |s| s.memory));
         report.line(&format!("{name:28} {:10.2} {:8.2} {cpu:14.3} {memory:14.0}", rate / 1e6, rate / bare));
-        if !matches!(kind, Kind::Bare | Kind::Keep) {
+        if !matches!(kind, Kind::Bare | Kind::Keep | Kind::Write) {
             chart.push((format!("in, batches of {size}, {name}"), rate / bare));
         }
     }
@@ -151,7 +152,7 @@ async fn subscribe(
 ) -> Result<(), Box<dyn Error>> {
     report.line(&format!("\nout: {RECORDS} records to {subscribers} at once"));
     report.line(&format!("{:28} {:>10} {:>8} {:>14}", "", "M rec/s", "ratio", "us CPU/record"));
-    let kinds = [KINDS[0], KINDS[2]];
+    let kinds = [KINDS[0], KINDS[3]];
     let mut samples = [Vec::new(), Vec::new()];
     for _ in 0..rounds {
         for ((kind, _), samples) in kinds.iter().zip(&mut samples) {
@@ -249,7 +250,7 @@ async fn latency(report: &mut Report, load: bool) -> Result<(), Box<dyn Error>> 
     report.line(&format!("\nlatency: {PING_RECORDS} records from the call of Insert to a subscriber; {about}"));
     report.line(&format!("{:28} {:>10} {:>10} {:>10}", "", "p50 us", "p99 us", "added p50"));
     let mut bare = f64::NAN;
-    for (kind, name) in KINDS.into_iter().filter(|(kind, _)| *kind != Kind::Keep) {
+    for (kind, name) in KINDS.into_iter().filter(|(kind, _)| !matches!(kind, Kind::Keep | Kind::Write)) {
         let host = Host::start(kind, 0, 1)?;
         let mut cache = client::cache(host.connect());
         let position = if kind == Kind::Bare { LIVE } else { 0 };

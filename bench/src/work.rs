@@ -37,6 +37,8 @@ const PIXEL: f32 = 20.0;
 pub struct Watch {
     /// Leases worked on.
     pub leases: AtomicU64,
+    /// Mean time of a gather, microseconds.
+    pub gather: AtomicU64,
     /// Records made, those made twice included.
     pub made: AtomicU64,
     /// How each worker finds what its replica holds.
@@ -65,8 +67,8 @@ pub struct Pretended {
     known: OnceLock<()>,
 }
 
-/// The frame: what a renderer would ask for, with the mean time of a gather, microseconds, in the place of its rays.
-pub fn spec(width: u32, height: u32, gather: u32) -> v1::FrameSpec {
+/// The frame: what a renderer would ask for.
+pub fn spec(width: u32, height: u32) -> v1::FrameSpec {
     let vector = Some(v1::Vector { x: 1.0, y: 0.0, z: 0.0 });
     v1::FrameSpec {
         scene: "simulated".into(),
@@ -79,7 +81,7 @@ pub fn spec(width: u32, height: u32, gather: u32) -> v1::FrameSpec {
         spp: 32,
         method: "irradiance".into(),
         a: records::A,
-        rays: gather,
+        rays: 2048,
         bounces: 2,
         seed: 0,
         levels: 2,
@@ -90,8 +92,9 @@ pub fn spec(width: u32, height: u32, gather: u32) -> v1::FrameSpec {
 impl Job for Pretended {
     async fn prepare(described: &v1::DescribeResponse) -> Result<Self, String> {
         let spec = described.spec.clone().ok_or("no frame described")?;
-        let v1::FrameSpec { width, height, rays, .. } = spec;
-        Ok(Self { width, height, gather: rays as f32, owed: Mutex::default(), known: OnceLock::new() })
+        let v1::FrameSpec { width, height, .. } = spec;
+        let gather = watch().gather.load(Ordering::Relaxed) as f32;
+        Ok(Self { width, height, gather, owed: Mutex::default(), known: OnceLock::new() })
     }
 
     /// One level, which its records are not of: they are kept and their digest is checked, but no cache is made of them.

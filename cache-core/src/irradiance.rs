@@ -173,6 +173,10 @@ impl Cached for Irradiance {
 /// No scene is larger: squares of such lengths still fit a float, so nothing derived from a record overflows.
 const LENGTH_MAX: f32 = 1e18;
 
+/// Least R, as part of the record's distance from the origin and of radius_max: 2^-32, some 500 times less than the
+/// spacing of floats.
+const RADIUS_LEAST: f32 = 1.0 / (1u64 << 32) as f32;
+
 /// How far, in R, a record may lie in front of a query and still count: enough for curved surfaces made of facets.
 const IN_FRONT_TOLERANCE: f32 = 0.01;
 
@@ -249,6 +253,11 @@ impl Irradiance {
         }
         positive("radius", self.radius)?;
         positive("radius_min", self.radius_min)?;
+        // Far below the spacing of floats there, R tells nothing; clamped by it, all records around would be worth nothing.
+        if self.radius <= RADIUS_LEAST * reach.max(self.radius_max) {
+            let expected = "more than 2^-32 of its distance from the origin and of radius_max";
+            return Err(Invalid::Range { field: "radius", value: self.radius, expected });
+        }
         for (field, value) in [("radius", self.radius), ("radius_max", self.radius_max)] {
             if value > LENGTH_MAX {
                 return Err(Invalid::Range { field, value, expected: "at most 1e18" });
@@ -310,13 +319,15 @@ mod tests {
     #[test]
     fn unsound_records_are_refused_by_name() {
         type Spoil = fn(&mut Irradiance);
-        let spoilt: [(&str, Spoil); 11] = [
+        let spoilt: [(&str, Spoil); 13] = [
             ("position", |r| r.position.x = f32::NAN),
             ("gradient_r", |r| r.gradient_r[2].y = f32::INFINITY),
             ("radius", |r| r.radius = f32::INFINITY),
             ("normal", |r| r.normal = Vec3::new(0.0, 2.0, 0.0)),
             ("irradiance", |r| r.irradiance.y = -1e-6),
             ("radius", |r| r.radius = 0.0),
+            ("radius", |r| r.radius = 1e-30),
+            ("radius", |r| (r.position, r.radius) = (Vec3::Y * -1e6, 1e-4)),
             ("radius_min", |r| r.radius_min = -1.0),
             ("radius_max", |r| r.radius_max = 0.01),
             ("ellipse", |r| r.ellipse = [1.0, 2.0, 1.0]),

@@ -28,8 +28,8 @@ const COMPLETE_BYTES_MAX: usize = 4 << 20;
 /// workers finish a step together (guided self-scheduling).
 const SHARES: u32 = 4;
 
-/// What a lease should take at least, as far as those done tell: a small part of that is spent on giving it out. No
-/// lease is more than an equal share for that.
+/// What a lease should take at least, as far as those done tell: a small part of that is spent on giving it out. Where
+/// a whole step is little work, some of many workers get none of it.
 const LEASE_LEAST: Duration = Duration::from_millis(10);
 
 /// Most reasons of workers that wait for the owner; more are dropped, the first ones say enough.
@@ -77,6 +77,8 @@ pub struct Frame {
     leases_lost: u32,
     counts: BTreeMap<String, f64>,
     unfit: BTreeSet<Arc<str>>,
+    /// Its records are all there and are not published yet.
+    publishing: bool,
     outbox: Outbox,
 }
 
@@ -106,6 +108,7 @@ impl Frame {
             leases_lost: 0,
             counts: BTreeMap::new(),
             unfit: BTreeSet::new(),
+            publishing: false,
             outbox: Outbox { opening: true, progress: true, ..Outbox::default() },
         };
         frame.advance(0, mark);
@@ -136,7 +139,7 @@ impl Frame {
         let fit = workers.saturating_sub(self.unfit.len() as u32).max(1);
         let round = self.round.as_mut()?;
         let pending = round.pending_tiles();
-        let least = round.tiles_in(LEASE_LEAST).min(pending / fit);
+        let least = round.tiles_in(LEASE_LEAST);
         let share = (pending / fit.saturating_mul(SHARES)).max(least).max(1);
         let tiles =
             (room > 0).then(|| round.grant(lease, worker.clone(), share.min(room), now, now + LEASE_TIME))??;
@@ -185,10 +188,11 @@ impl Frame {
         let Some(held) = round.held(request.lease, &request.worker) else { return Ok(false) };
         let expected = if round.makes_pixels() { held.tiles.clone() } else { 0..0 };
         check_gathered(request.gathered)?;
+        let worked = worked(request.worked_seconds)?;
         check_tiles(&self.job, expected, &request.tiles)?;
         check_counts(&self.counts, &request.counts)?;
 
-        round.complete(request.lease, request.gathered, now);
+        round.complete(request.lease, request.gathered, worked, now);
         for count in request.counts {
             *self.counts.entry(count.name).or_default() += count.value;
         }
@@ -198,8 +202,15 @@ impl Frame {
         if round.is_over() {
             let gathered = round.gathered();
             self.advance(gathered, mark);
+            let filled = self.round.as_ref().is_some_and(Round::makes_pixels) && self.job.spec.levels > 0;
+            self.publishing |= filled;
         }
         Ok(true)
+    }
+
+    /// Its records are published, or will not be: who is told that it is done may rely on that.
+    pub fn published(&mut self) {
+        self.publishing = false;
     }
 
     fn advance(&mut self, gathered: u64, mark: impl FnOnce(u32) -> Mark) {
@@ -223,14 +234,14 @@ impl Frame {
     }
 
     /// Gives a worker no more of this frame, and tells the owner why.
-    pub fn decline(&mut self, worker: Arc<str>, mut reason: String) {
+    pub fn decline(&mut self, worker: Arc<str>, mut reason: String, for_all: bool) {
         if let Some(round) = &mut self.round {
             round.put_back(|held| held.worker == worker);
         }
         let cut = (0..=REASON_MAX.min(reason.len())).rev().find(|&at| reason.is_char_boundary(at));
         reason.truncate(cut.unwrap_or(0));
         if self.outbox.declined.len() < DECLINES_MAX {
-            self.outbox.declined.push_back(v1::FrameDeclined { worker: worker.to_string(), reason });
+            self.outbox.declined.push_back(v1::FrameDeclined { worker: worker.to_string(), reason, for_all });
         }
         self.unfit.insert(worker);
     }
@@ -277,7 +288,7 @@ impl Frame {
             outbox.tile_bytes -= tile.pixels.len();
             return Some(Event::Tile(tile));
         }
-        if self.round.is_some() || std::mem::replace(&mut outbox.ended, true) {
+        if self.round.is_some() || self.publishing || std::mem::replace(&mut outbox.ended, true) {
             return None;
         }
         // The last step made the pixels; what it read is what the steps before it gathered.
@@ -299,6 +310,11 @@ fn check_gathered(gathered: u64) -> Result<(), Refusal> {
         return Ok(());
     }
     Err(Refusal::field("gathered", format!("is {gathered}, expected at most {}", u32::MAX)))
+}
+
+fn worked(seconds: f64) -> Result<Duration, Refusal> {
+    Duration::try_from_secs_f64(seconds)
+        .map_err(|_| Refusal::field("worked_seconds", format!("is {seconds}, expected a time")))
 }
 
 fn check_tiles(job: &Job, expected: Range<u32>, tiles: &[v1::FrameTile]) -> Result<(), Refusal> {

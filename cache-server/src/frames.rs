@@ -30,8 +30,19 @@ pub struct Changes {
     pub work: bool,
     /// There may be something to tell: owners of frames.
     pub news: bool,
-    /// The draft of a frame that makes records is whole and may be published, and where to.
-    pub filled: Option<(Namespace, Namespace)>,
+    /// The draft of a frame that makes records is whole and is to be published.
+    pub filled: Option<Filled>,
+}
+
+/// A frame whose records are all there.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Filled {
+    /// Which.
+    pub frame: u64,
+    /// Where its records are.
+    pub draft: Namespace,
+    /// Where they belong.
+    pub namespace: Namespace,
 }
 
 /// Every open frame, and every worker heard of lately.
@@ -124,7 +135,7 @@ impl Frames {
             *heard = now;
         }
         let Some(frame) = self.frames.get_mut(&request.frame) else { return Ok(false) };
-        let draft = frame.origin().draft;
+        let (number, draft) = (request.frame, frame.origin().draft);
         let (step, had_work) = (frame.round().map(|round| round.step().index), frame.has_work());
         let since = frame.round().and_then(|round| round.held(request.lease, &request.worker)).map(|held| held.since);
         let accepted = frame.complete(request, now, |step| mark(&draft, step))?;
@@ -137,22 +148,36 @@ impl Frames {
         let advanced = step != frame.round().map(|round| round.step().index);
         self.changes.work |= frame.has_work() && (!had_work || advanced);
         if accepted && pixels && advanced && frame.job().spec.levels > 0 {
-            self.changes.filled = Some((draft, frame.job().namespace));
+            self.changes.filled = Some(Filled { frame: number, draft, namespace: frame.job().namespace });
         }
         Ok(accepted)
+    }
+
+    /// A frame that was filled is published, or will not be: its owner may be told that it is done.
+    pub fn published(&mut self, frame: u64) {
+        if let Some(frame) = self.frames.get_mut(&frame) {
+            frame.published();
+            self.changes.news = true;
+        }
+    }
+
+    /// Whether a frame is open.
+    pub fn is_open(&self, frame: u64) -> bool {
+        self.frames.contains_key(&frame)
     }
 
     /// A worker cannot do a frame, and says why: it gets no more of it, the owner is told.
     ///
     /// # Errors
     /// [`Refusal::NoFrame`], or [`Refusal::Full`] when there are too many workers.
-    pub fn decline(&mut self, worker: &str, frame: u64, reason: String, now: Duration) -> Result<(), Refusal> {
+    pub fn decline(&mut self, request: v1::DeclineRequest, now: Duration) -> Result<(), Refusal> {
+        let v1::DeclineRequest { worker, frame, reason, for_all } = request;
         if !self.frames.contains_key(&frame) {
             return Err(Refusal::NoFrame(frame));
         }
-        let worker = self.hear(worker, now)?;
+        let worker = self.hear(&worker, now)?;
         if let Some(frame) = self.frames.get_mut(&frame) {
-            frame.decline(worker, reason);
+            frame.decline(worker, reason, for_all);
         }
         (self.changes.work, self.changes.news) = (true, true);
         Ok(())

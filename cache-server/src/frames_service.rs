@@ -18,7 +18,7 @@ use crate::access::{Tenant, tenant};
 use crate::bell::{Bell, Listener};
 use crate::clock::Clock;
 use crate::frame::{News, Origin};
-use crate::frames::{Changes, Frames};
+use crate::frames::{Changes, Filled, Frames};
 use crate::limits::Limits;
 use crate::refusal::{Refusal, same_version};
 use crate::replica::Mark;
@@ -31,6 +31,9 @@ const LEASE_WAIT: Duration = Duration::from_secs(10);
 /// How long a frame that is opened again waits for the records it was begun with, when the server lost its own: workers
 /// bring them back.
 const REFILL_WAIT: Duration = Duration::from_secs(10);
+
+/// Pause before a journal that failed is asked again to keep a publication.
+const PUBLISH_AGAIN: Duration = Duration::from_millis(500);
 
 /// The frames shared between tasks, with the bells that tell of work and news.
 ///
@@ -158,6 +161,20 @@ impl Board {
         }
     }
 
+    /// Publishes what a frame gathered, as soon as the disk has room; then lets its owner hear that it is done.
+    async fn publish(self: Arc<Self>, filled: Filled) {
+        let Filled { frame, draft, namespace } = filled;
+        while let Err(refusal) = self.store.publish(draft, namespace).await {
+            tracing::warn!(frame, "the records of a filled frame stay a draft: {refusal}");
+            // For any other reason it stays one: the picture does not need more, and a frame begun again finds it.
+            if !matches!(refusal, Refusal::Journal(_)) || !lock(&self.frames).is_open(frame) {
+                break;
+            }
+            tokio::time::sleep(PUBLISH_AGAIN).await;
+        }
+        self.change(|frames, _| frames.published(frame));
+    }
+
     /// Waits for work; `None` when none came up in time.
     async fn lease(&self, tenant: &Tenant, worker: &str) -> Result<Option<v1::Lease>, Refusal> {
         let mut work = self.work.listen();
@@ -233,21 +250,19 @@ impl FramesTrait for FramesService {
         let mark = |draft: &Namespace, step| self.0.mark(draft, step);
         let (accepted, changes) = self.0.change_and(|frames, now| frames.complete(request, now, mark));
         let accepted = accepted?;
-        if let Some((draft, namespace)) = changes.filled
-            && let Err(refusal) = self.0.store.publish(draft, namespace).await
-        {
-            // The picture does not need it, and a frame begun again finds the draft.
-            tracing::warn!("the records of a filled frame stay a draft: {refusal}");
+        if let Some(filled) = changes.filled {
+            // Whoever brought the last records may be gone before they are published.
+            tokio::spawn(self.0.clone().publish(filled));
         }
         Ok(Response::new(v1::CompleteResponse { accepted }))
     }
 
     async fn decline(&self, request: Request<v1::DeclineRequest>) -> Result<Response<v1::DeclineResponse>, Status> {
         let tenant = tenant(&request);
-        let v1::DeclineRequest { worker, frame, reason } = request.into_inner();
-        let worker = named(&tenant, &worker)?;
-        lock(&self.0.frames).frame(&tenant, frame)?;
-        self.0.change(|frames, now| frames.decline(&worker, frame, reason, now))?;
+        let mut request = request.into_inner();
+        request.worker = named(&tenant, &request.worker)?;
+        lock(&self.0.frames).frame(&tenant, request.frame)?;
+        self.0.change(|frames, now| frames.decline(request, now))?;
         Ok(Response::new(v1::DeclineResponse {}))
     }
 

@@ -173,6 +173,7 @@ impl Farm {
             gathered,
             tiles: if step.level == 0 { tiles.clone().map(pixels).collect() } else { vec![] },
             counts: vec![v1::Count { name: "rays".into(), value: tiles.len() as f64 }],
+            worked_seconds: 0.0,
         };
         let position = self.log.get();
         let mark = |_: &Namespace, _| Mark { position, ..Mark::default() };
@@ -204,6 +205,7 @@ impl Farm {
         while self.lease("worker 0") {
             self.act(&Act::Complete(0));
         }
+        self.frames.published(self.frame);
         self.listen();
     }
 }
@@ -261,6 +263,7 @@ fn complete_at(
         lease: lease.id,
         frame: lease.frame,
         tiles: (lease.tile_from..lease.tile_to).map(tile).collect(),
+        worked_seconds: now.as_secs_f64(),
         ..Default::default()
     };
     frames.complete(request, now, |_, _| Mark::default())
@@ -342,7 +345,9 @@ fn older_frames_come_first_and_a_worker_that_declined_gets_the_next() {
     let mut frames = Frames::new(Limits::default(), 1);
     let (old, new) = (open(&mut frames, 4, 0), open(&mut frames, 4, 0));
     assert_eq!(lease(&mut frames, "a", 0).expect("work").frame, old);
-    frames.decline("a", old, "no such file".repeat(1000), Duration::ZERO).expect("told");
+    let reason = "no such file".repeat(1000);
+    let decline = v1::DeclineRequest { worker: "a".into(), frame: old, reason, for_all: false };
+    frames.decline(decline, Duration::ZERO).expect("told");
     assert_eq!(lease(&mut frames, "a", 0).expect("work").frame, new);
     assert_eq!(lease(&mut frames, "b", 0).map(|l| (l.frame, l.tile_from)), Some((old, 0)));
     let mut declined = None;
@@ -400,11 +405,15 @@ fn what_a_worker_says_wrong_is_named_and_its_lease_stays() {
         gathered,
         tiles: (work.tile_from..work.tile_to).map(|tile| v1::FrameTile { tile, pixels: vec![0; 48].into() }).collect(),
         counts: vec![v1::Count { name: name.into(), value }],
+        worked_seconds: 0.0,
     };
     let mut say = |request| frames.complete(request, Duration::ZERO, |_, _| Mark::default());
     named(say(saying(u64::MAX, "rays", 1.0)), "gathered");
     named(say(saying(0, "rays", f64::NAN)), "counts.value");
     named(say(saying(0, &"x".repeat(65), 1.0)), "counts.name");
+    for worked_seconds in [-1.0, f64::NAN, 1e300] {
+        named(say(v1::CompleteRequest { worked_seconds, ..saying(0, "rays", 1.0) }), "worked_seconds");
+    }
     assert!(!say(v1::CompleteRequest { worker: "b".into(), ..saying(0, "rays", 1.0) }).expect("not b's"));
     assert!(say(saying(0, "rays", 1.0)).expect("sound"));
 }
@@ -467,11 +476,18 @@ fn a_step_reads_what_lower_steps_gathered_and_a_filled_draft_is_told_once() {
         filled.extend(frames.take_changes().filled.map(|filled| (filled, step.index)));
         steps = step.index;
     }
-    assert_eq!(filled, [((draft, namespace), steps - 1)]);
+    assert_eq!(filled, [(Filled { frame, draft, namespace }, steps - 1)]);
     let mut told = vec![];
-    while let News::Tell(event) = frames.news(frame, mark) {
-        told.extend(event.event);
-    }
+    let hear = |frames: &mut Frames, told: &mut Vec<_>| {
+        while let News::Tell(event) = frames.news(frame, mark) {
+            told.extend(event.event);
+        }
+    };
+    hear(&mut frames, &mut told);
+    assert!(matches!(told.last(), Some(Event::Tile(_))), "done before its records are published: {told:?}");
+    frames.published(frame);
+    assert!(frames.take_changes().news);
+    hear(&mut frames, &mut told);
     assert!(matches!(&told[0], Event::Opened(opened) if opened.base_records == 7 && opened.base[0] == 70));
     let Some(Event::Done(done)) = told.last() else { panic!("{told:?}") };
     assert_eq!(done.records, 7 + u64::from(steps));
@@ -487,4 +503,37 @@ fn a_lease_its_worker_never_heard_of_runs_out() {
     frames.renew("a", &BTreeSet::from([heard.id]), Duration::from_secs(5));
     frames.tick(Duration::from_secs(7));
     assert_eq!(frames.renew("a", &BTreeSet::from([heard.id, unheard.id]), Duration::from_secs(7)), [heard.id]);
+}
+
+/// Two workers that wait ten seconds for the processor with each lease, and say that they worked a millisecond a tile.
+#[test]
+fn leases_are_as_long_as_the_work_takes_however_long_it_waits() {
+    let sizes = |worked_a_tile: f64| {
+        let mut frames = Frames::new(Limits::default(), 1);
+        open(&mut frames, 400, 0);
+        let (mut sizes, mut now) = (vec![], 0);
+        lease(&mut frames, "idle", now);
+        while let Some(work) = lease(&mut frames, "a", now) {
+            now += 5;
+            sizes.push(work.tile_to - work.tile_from);
+            let tile = |tile| v1::FrameTile { tile, pixels: vec![0; 48].into() };
+            let request = v1::CompleteRequest {
+                worker: "a".into(),
+                lease: work.id,
+                frame: work.frame,
+                tiles: (work.tile_from..work.tile_to).map(tile).collect(),
+                worked_seconds: worked_a_tile * f64::from(work.tile_to - work.tile_from),
+                ..Default::default()
+            };
+            assert!(frames.complete(request, Duration::from_secs(now), |_, _| Mark::default()).expect("sound"));
+        }
+        sizes
+    };
+    // Ten milliseconds of work, unless that is more than half of what is left.
+    let short = sizes(1e-3);
+    assert!(short.iter().rev().skip_while(|size| **size < 10).all(|size| *size >= 10), "{short:?}");
+    assert!(short.contains(&10), "{short:?}");
+    // Work that takes long is cut small near the end; nobody worked longer than it had the lease.
+    assert_eq!(sizes(1e9).last(), Some(&1));
+    assert!(sizes(1e9).len() > short.len());
 }

@@ -46,7 +46,7 @@ impl Inflow {
         let beyond = beyond(before + bytes) - beyond(before);
         let shared = self.shared.fetch_add(beyond, Ordering::Relaxed) + beyond;
         if beyond > 0 && shared > self.most {
-            return Err(Refusal::Full { what: "bytes of messages under way", most: self.most });
+            return Err(Refusal::Busy { what: "bytes of messages under way", most: self.most });
         }
         Ok(())
     }

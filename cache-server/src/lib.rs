@@ -54,6 +54,7 @@ pub mod door;
 pub mod gate;
 pub mod inflow;
 pub mod metrics;
+mod scrape;
 
 pub mod health;
 pub mod listen;

@@ -9,6 +9,7 @@ use metrics_exporter_prometheus::{Matcher, PrometheusBuilder};
 use tonic::Code;
 
 use crate::listen::ServeError;
+use crate::scrape;
 
 /// Upper bounds of the histograms of times, seconds: from a page cache to a disk that is in trouble; and of a lease.
 const JOURNAL_SECONDS: [f64; 10] = [0.0001, 0.0003, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0];
@@ -28,7 +29,8 @@ pub fn publish(address: SocketAddr) -> Result<(), ServeError> {
     let builder = buckets.into_iter().try_fold(PrometheusBuilder::new(), |builder, (name, bounds)| {
         builder.set_buckets_for_metric(Matcher::Full(name.into()), bounds)
     });
-    builder.and_then(|builder| builder.with_http_listener(address).install()).map_err(|error| failed(&error))?;
+    let page = builder.and_then(PrometheusBuilder::install_recorder).map_err(|error| failed(&error))?;
+    scrape::publish(address, page).map_err(|error| failed(&error))?;
     describe();
     Ok(())
 }

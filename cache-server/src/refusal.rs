@@ -26,9 +26,17 @@ pub enum Refusal {
         /// What it was and what would have been right.
         reason: String,
     },
-    /// A stated bound of the server is reached. Ask for less, or wait.
+    /// A stated bound of what the server keeps is reached. Ask for less.
     #[error("no room for more {what}: this server keeps at most {most}")]
     Full {
+        /// Of what.
+        what: &'static str,
+        /// The bound.
+        most: usize,
+    },
+    /// Others use all there is of something just now. Come again later.
+    #[error("no room for more {what}: this server takes at most {most}")]
+    Busy {
         /// Of what.
         what: &'static str,
         /// The bound.
@@ -101,7 +109,7 @@ impl From<Refusal> for Status {
             Refusal::NoFrame(_) | Refusal::Published => Status::not_found(message),
             Refusal::Unknown(_) => Status::unauthenticated(message),
             Refusal::Foreign(_) => Status::permission_denied(message),
-            Refusal::Closing | Refusal::Journal(_) => Status::unavailable(message),
+            Refusal::Busy { .. } | Refusal::Closing | Refusal::Journal(_) => Status::unavailable(message),
             Refusal::Internal(_) => Status::internal(message),
         }
     }

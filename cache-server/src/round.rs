@@ -38,8 +38,8 @@ pub struct Round {
     tiles: u32,
     empty: Empty,
     gathered: u64,
-    /// Time from grant to end of the leases that are done, all together.
-    spent: Duration,
+    /// Time worked in the leases that are done, all together; not what they waited, for the processor, say.
+    worked: Duration,
 }
 
 /// Which tiles have nothing to do: no pixel whose rank the step tests lies in them.
@@ -86,7 +86,7 @@ impl Round {
             tiles,
             empty,
             gathered: 0,
-            spent: Duration::ZERO,
+            worked: Duration::ZERO,
         }
     }
 
@@ -132,9 +132,9 @@ impl Round {
 
     /// How many tiles take one worker that long, as far as those done tell; 0 if they tell nothing.
     pub fn tiles_in(&self, time: Duration) -> u32 {
-        let tiles = f64::from(self.done_tiles()) * time.as_secs_f64() / self.spent.as_secs_f64();
+        let tiles = f64::from(self.done_tiles()) * time.as_secs_f64() / self.worked.as_secs_f64();
         // Infinity and what is more than all saturate.
-        if self.spent.is_zero() { 0 } else { tiles as u32 }
+        if self.worked.is_zero() { 0 } else { tiles as u32 }
     }
 
     /// Leases up to `most` of the lowest pending tiles, contiguous, and empty ones behind them; more if all those are
@@ -186,12 +186,13 @@ impl Round {
         }
     }
 
-    /// Ends a lease whose tiles are done. Unknown leases change nothing.
-    pub fn complete(&mut self, lease: u64, gathered: u64, now: Duration) {
+    /// Ends a lease whose tiles are done and took so long to work on. Unknown leases change nothing.
+    pub fn complete(&mut self, lease: u64, gathered: u64, worked: Duration, now: Duration) {
         if let Some(held) = self.leases.remove(&lease) {
             self.leased_tiles -= held.tiles.end - held.tiles.start;
             self.gathered += gathered;
-            self.spent += now.saturating_sub(held.since);
+            // Nobody works longer than it has the work.
+            self.worked += worked.min(now.saturating_sub(held.since));
         }
     }
 

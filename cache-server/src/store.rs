@@ -200,6 +200,26 @@ impl Shared {
     fn write<T>(&self, change: impl FnOnce(&mut Replica) -> T) -> T {
         change(&mut self.replica.write().unwrap_or_else(PoisonError::into_inner))
     }
+
+    /// Shows what is durable, and acknowledges it.
+    fn show(&self, group: Group) {
+        for pending in group.pending {
+            let kept = self.write(|replica| replica.apply(pending.checked));
+            self.grown.ring();
+            // Who does not wait for the answer any more will ask again.
+            drop(pending.kept.send(kept));
+        }
+    }
+}
+
+impl Group {
+    /// Tells that it is not kept.
+    fn refuse(self, error: &io::Error) {
+        for pending in self.pending {
+            let refusal = Refusal::Journal(io::Error::new(error.kind(), error.to_string()));
+            drop(pending.kept.send(Err(refusal)));
+        }
+    }
 }
 
 /// The only task that changes what the store keeps.
@@ -210,65 +230,79 @@ pub struct Writer {
     shared: Arc<Shared>,
 }
 
-impl Writer {
-    /// Writes until the store is dropped.
-    pub async fn run(mut self) {
-        let mut group = Vec::new();
-        while self.waiting.recv_many(&mut group, GROUP_MAX).await > 0 {
-            self.write(std::mem::take(&mut group)).await;
-        }
-    }
+/// Entries that are made durable together, then shown.
+#[derive(Default)]
+struct Group {
+    pending: Vec<Pending>,
+    /// Records of its batches.
+    records: usize,
+    /// Whose the namespaces are that it names.
+    owners: BTreeMap<Namespace, String>,
+}
 
-    /// Makes a group durable, then shows it.
-    async fn write(&mut self, group: Vec<Pending>) {
-        let group = self.admitted(group);
-        if group.is_empty() {
-            return;
-        }
-        let entries: Vec<Entry> = group.iter().map(|pending| pending.entry.clone()).collect();
-        let appended = self.append(entries).await;
-        self.shared.failing.store(appended.is_err(), Ordering::Relaxed);
-        for pending in group {
-            let kept = match &appended {
-                Ok(()) => self.shared.write(|replica| replica.apply(pending.checked)),
-                Err(error) => Err(Refusal::Journal(io::Error::new(error.kind(), error.to_string()))),
-            };
-            self.shared.grown.ring();
-            // Who does not wait for the answer any more will ask again.
-            drop(pending.kept.send(kept));
+impl Writer {
+    /// Writes until the store is dropped: while one group is made durable, the one before it is shown.
+    pub async fn run(mut self) {
+        let (mut durable, mut waiting) = (Group::default(), Vec::new());
+        loop {
+            if durable.pending.is_empty() {
+                if self.waiting.recv_many(&mut waiting, GROUP_MAX).await == 0 {
+                    return;
+                }
+            } else {
+                let more = std::iter::from_fn(|| self.waiting.try_recv().ok());
+                waiting.extend(more.take(GROUP_MAX));
+            }
+            let group = self.admitted(waiting.drain(..), &durable);
+            let shared = self.shared.clone();
+            let appending = self.append(group.pending.iter().map(|pending| pending.entry.clone()).collect());
+            let (appended, ()) = tokio::join!(biased; appending, async { shared.show(std::mem::take(&mut durable)) });
+            match appended {
+                Ok(()) => durable = group,
+                Err(error) => group.refuse(&error),
+            }
         }
     }
 
     /// Those whose namespaces are their tenants', and that there is room for, should all of their records be new.
     ///
-    /// Who asked before may have been overtaken: whose a namespace is, the first label here decides.
-    fn admitted(&self, group: Vec<Pending>) -> Vec<Pending> {
-        let (mut admitted, mut count, mut begun) = (Vec::with_capacity(group.len()), 0, BTreeMap::new());
-        for pending in group {
-            let admit = |replica: &mut Replica| match (&pending.checked, &pending.tenant) {
-                (Checked::Batch(namespace, _, records), Some(tenant)) => {
-                    replica.belongs(namespace, tenant)?;
-                    count += records.len();
-                    replica.admit(namespace, count)
+    /// Who asked before may have been overtaken: whose a namespace is, the first here decides. `before` is as good as
+    /// shown.
+    fn admitted(&self, waiting: impl Iterator<Item = Pending>, before: &Group) -> Group {
+        let mut group = Group::default();
+        for pending in waiting {
+            let named = match (&pending.checked, &pending.tenant) {
+                (Checked::Batch(namespace, _, records), Some(tenant)) => Some((namespace, tenant, records.len())),
+                (Checked::Label(namespace, ..), Some(tenant)) => Some((namespace, tenant, 0)),
+                _ => None,
+            };
+            let admit = |replica: &mut Replica| {
+                let Some((namespace, tenant, records)) = named else { return Ok(()) };
+                replica.belongs(namespace, tenant)?;
+                let owners = &mut group.owners;
+                let owner = before.owners.get(namespace).unwrap_or(owners.entry(*namespace).or_insert(tenant.clone()));
+                if owner != tenant {
+                    return Err(Refusal::Foreign(*namespace));
                 }
-                (Checked::Label(namespace, ..), Some(tenant)) => {
-                    replica.belongs(namespace, tenant)?;
-                    let owner = begun.entry(*namespace).or_insert_with(|| tenant.clone());
-                    if owner == tenant { Ok(()) } else { Err(Refusal::Foreign(*namespace)) }
-                }
-                _ => Ok(()),
+                replica.admit(namespace, before.records + group.records + records)?;
+                group.records += records;
+                Ok(())
             };
             match self.shared.write(admit) {
-                Ok(()) => admitted.push(pending),
+                Ok(()) => group.pending.push(pending),
                 Err(refusal) => drop(pending.kept.send(Err(refusal))),
             }
         }
-        admitted
+        group
     }
 
     async fn append(&mut self, entries: Vec<Entry>) -> io::Result<()> {
+        if entries.is_empty() {
+            return Ok(());
+        }
         let (count, clock) = (entries.len(), Clock::start());
         let appended = self.append_now(entries).await;
+        self.shared.failing.store(appended.is_err(), Ordering::Relaxed);
         match &appended {
             Ok(()) => metrics::appended(count, clock.now()),
             Err(error) => {

@@ -353,6 +353,7 @@ async fn work(server: &Server, name: &str) -> Infallible {
             gathered: gathered.len() as u64,
             tiles: if step.level == 0 { tiles.map(pixels).collect() } else { vec![] },
             counts: vec![v1::Count { name: "leases".into(), value: 1.0 }],
+            worked_seconds: 0.0,
         };
         soon(frames.complete(request)).await.expect("sound");
     }
@@ -455,7 +456,7 @@ async fn frames_refuse_by_name() {
     assert!(status.message().contains("spec is missing"), "{status}");
     let status = soon(frames.lease(ask(&"x".repeat(65)))).await.expect_err("too long");
     assert_eq!(status.code(), Code::InvalidArgument);
-    let decline = v1::DeclineRequest { worker: "w".into(), frame: 1, reason: "why".into() };
+    let decline = v1::DeclineRequest { worker: "w".into(), frame: 1, reason: "why".into(), for_all: false };
     assert_eq!(soon(frames.decline(decline)).await.expect_err("no frame").code(), Code::NotFound);
     server.stop().await;
 }

@@ -159,7 +159,6 @@ fn held<'a>(entries: impl Iterator<Item = &'a Checked<Irradiance>>) -> Vec<(Name
 
 fn united(entries: &[Checked<Irradiance>]) {
     let once = held(entries.iter());
-    assert_eq!(once, held(entries.iter().chain(entries)));
     let publications = entries.iter().filter_map(|entry| match entry {
         Checked::Publication { draft, namespace } => Some((*draft, *namespace)),
         _ => None,
@@ -169,6 +168,7 @@ fn united(entries: &[Checked<Irradiance>]) {
     // A server publishes a draft to one namespace, which is no draft.
     let proper = drafts.len() == publications.len() && publications.iter().all(|(_, n)| !drafts.contains(n));
     if proper {
+        assert_eq!(once, held(entries.iter().chain(entries)));
         assert_eq!(once, held(entries.iter().rev()));
     }
 }

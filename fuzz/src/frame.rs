@@ -99,7 +99,9 @@ impl Board {
             5 => self.frames.leave(&worker),
             6 => {
                 let reason = String::from_utf8_lossy(bytes).repeat(1 + usize::from(byte(bytes, 2)));
-                drop(self.frames.decline(&worker, byte(bytes, 1).into(), reason, self.now));
+                let (frame, for_all) = (byte(bytes, 1).into(), byte(bytes, 3) % 2 == 1);
+                let request = v1::DeclineRequest { worker, frame, reason, for_all };
+                drop(self.frames.decline(request, self.now));
             }
             7 => {
                 self.now += Duration::from_millis(100 * u64::from(byte(bytes, 0)));
@@ -112,7 +114,9 @@ impl Board {
                 self.open.retain(|open| *open != frame);
             }
         }
-        self.frames.take_changes();
+        if let Some(filled) = self.frames.take_changes().filled {
+            self.frames.published(filled.frame);
+        }
     }
 
     fn open(&mut self, spec: v1::FrameSpec) {
@@ -150,7 +154,15 @@ impl Board {
         let tiles = (lease.tile_from..last).map(tile).collect();
         let counts = vec![v1::Count { name: format!("count {}", more >> 3), value: f64::MAX }];
         let (lease, frame, gathered) = (lease.id, lease.frame, gathered.into());
-        self.complete(v1::CompleteRequest { worker, lease, frame, gathered, tiles, counts });
+        self.complete(v1::CompleteRequest {
+            worker,
+            lease,
+            frame,
+            gathered,
+            tiles,
+            counts,
+            worked_seconds: f64::from(byte(bytes, 4)) / 64.0,
+        });
     }
 
     fn listen(&mut self, frame: u64) {

@@ -51,6 +51,9 @@ fn record() -> Vec<Vec<u8>> {
         many(1, |_, _| ()),
         many(5, |_, _| ()),
         many(4, |r, n| (r.radius, r.radius_min) = (1e-30 * f32::from(n + 1), 1e-38)),
+        many(4, |r, n| (r.radius, r.position) = (1e-30, Vec3::splat(1e-22 * f32::from(n)))),
+        many(4, |r, n| (r.radius, r.radius_max, r.position.x) = (3e-9, 0.1, f32::from(n))),
+        many(3, |r, n| r.irradiance.z = [f32::NAN, f32::INFINITY, -0.0][usize::from(n)]),
         many(4, |r, n| (r.position.x, r.radius, r.radius_max) = (1e18 / f32::from(n + 1), 1e18, 1e18)),
     ]
 }
@@ -90,7 +93,21 @@ fn batch() -> Vec<Vec<u8>> {
         piece(1, &[1]),
         piece(5, &[2, 0, 9, 8]),
     ];
-    vec![insert.encode_to_vec(), piece(0, &payload(&entries())), short.concat()]
+    // A batch that says it holds a billion records, alone and as an entry; one of a length beyond any memory.
+    let claim = |bytes: u64| {
+        let mut claim = vec![0x0a];
+        prost::encoding::encode_varint(bytes, &mut claim);
+        [&claim, &insert.encode_to_vec()[2..]].concat()
+    };
+    let entry = [&[255, 255, 255, 255, 7][..], &claim(128_000_000_000)].concat();
+    vec![
+        insert.encode_to_vec(),
+        piece(0, &payload(&entries())),
+        short.concat(),
+        claim(128_000_000_000),
+        claim(u64::MAX),
+        piece(0, &entry),
+    ]
 }
 
 fn store() -> Vec<Vec<u8>> {
@@ -113,7 +130,14 @@ fn store() -> Vec<Vec<u8>> {
         &piece(4, &[&[9, 2][..], &payload(&entries()[3..])].concat()),
         &piece(254, &[255, 255, 0]),
     ];
-    [[&[0][..], &value].concat(), values.concat()].into_iter().chain(patched).collect()
+    // Headers that claim four gigabytes, and more records than can be counted.
+    let claims = [(12, 4), (24, 16)].map(|(at, bytes)| {
+        let mut value = [&[0][..], &value].concat();
+        value[1 + at..1 + at + bytes].fill(0xff);
+        value
+    });
+    let whole = [[&[0][..], &value].concat(), values.concat()];
+    whole.into_iter().chain(claims).chain(patched).collect()
 }
 
 fn scene() -> Vec<Vec<u8>> {
@@ -163,7 +187,16 @@ fn opened() -> Vec<Vec<u8>> {
         gathered: 0,
         tiles,
         counts: vec![v1::Count { name: "queries".into(), value: 3.0 }],
+        worked_seconds: 0.25,
     };
+    let claims = [
+        v1::CompleteRequest { gathered: u64::MAX, ..complete.clone() },
+        v1::CompleteRequest { worked_seconds: f64::NAN, ..complete.clone() },
+        v1::CompleteRequest { worked_seconds: f64::MAX, tiles: Vec::new(), ..complete.clone() },
+    ];
+    let claims = claims.map(|request| [piece(2, &[0]), piece(1, &request.encode_to_vec())].concat()).concat();
+    let huge = [(u32::MAX, 1), (65536, 65536), (1, u32::MAX)]
+        .map(|(width, height)| piece(0, &open(v1::FrameSpec { width, height, tile_size: 1, ..frame::spec() })));
     let rounds = [piece(2, &[0]), piece(2, &[1]), piece(3, &[0, 0, 13, 0]), piece(3, &[0, 0, 13, 1])].concat();
     let pixels = [piece(0, &open(path)), piece(9, &[1]), rounds.clone(), piece(8, &[2])].concat();
     let late = [piece(2, &[0]), piece(7, &[70]), piece(2, &[1]), piece(4, &[1]), piece(6, b"\x01\x01why")].concat();
@@ -173,5 +206,7 @@ fn opened() -> Vec<Vec<u8>> {
         rounds.repeat(12),
         [piece(2, &[0]), piece(1, &complete.encode_to_vec())].concat(),
         [late, piece(5, &[1]), piece(8, &[1])].concat(),
+        claims,
+        huge.concat(),
     ]
 }

@@ -19,6 +19,8 @@ pub struct Disk(Arc<Mutex<Inner>>);
 struct Inner {
     entries: Vec<Entry>,
     full: bool,
+    /// How often all that was on it was lost.
+    losses: u32,
     random: Random,
 }
 
@@ -26,7 +28,7 @@ impl Disk {
     /// An empty disk, whose failures are drawn from the seed.
     pub fn new(seed: u64) -> Self {
         let random = Random::named("disk", &[seed]);
-        Self(Arc::new(Mutex::new(Inner { entries: Vec::new(), full: false, random })))
+        Self(Arc::new(Mutex::new(Inner { entries: Vec::new(), full: false, losses: 0, random })))
     }
 
     fn lock(&self) -> MutexGuard<'_, Inner> {
@@ -35,7 +37,14 @@ impl Disk {
 
     /// Loses all that is on it.
     pub fn lose(&self) {
-        self.lock().entries.clear();
+        let mut disk = self.lock();
+        disk.entries.clear();
+        disk.losses += 1;
+    }
+
+    /// How often all that was on it was lost.
+    pub fn losses(&self) -> u32 {
+        self.lock().losses
     }
 
     /// Whether it takes no more from now on.

@@ -41,8 +41,12 @@ pub struct Farm {
     pub away: watch::Sender<Duration>,
     /// The sharer inserts nothing more.
     pub quiet: Cell<bool>,
+    /// Records the sharer sent.
+    pub sent: RefCell<BTreeSet<RecordId>>,
     /// Records the sharer was told are kept.
     pub acknowledged: RefCell<BTreeSet<RecordId>>,
+    /// Records that a lost disk may have taken along, until they are seen on the new one.
+    pub owed: RefCell<BTreeSet<RecordId>>,
     /// What each witness follows now, if it runs.
     pub replicas: RefCell<BTreeMap<&'static str, Vec<(Namespace, Follower)>>>,
     /// The frames of each owner.
@@ -59,7 +63,9 @@ impl Farm {
             clock: watch::Sender::default(),
             away: watch::Sender::default(),
             quiet: Cell::default(),
+            sent: RefCell::default(),
             acknowledged: RefCell::default(),
+            owed: RefCell::default(),
             replicas: RefCell::default(),
             frames: RefCell::new(frames),
             started: Cell::default(),
@@ -70,6 +76,13 @@ impl Farm {
     fn start(&self) -> u64 {
         self.started.set(self.started.get() + 1);
         self.started.get()
+    }
+
+    /// Whether the server showed a record that only shares to some witness.
+    pub fn is_shown(&self, id: RecordId) -> bool {
+        let replicas = self.replicas.borrow();
+        let mut of_namespace = replicas.values().flatten().filter(|(followed, _)| *followed == SHARED);
+        of_namespace.any(|(_, follower)| follower.read(|replica| replica.get(id).is_some()))
     }
 
     /// Whether some witness holds a record.
@@ -129,6 +142,7 @@ pub async fn sharer(farm: Rc<Farm>) -> turmoil::Result {
         let ids =
             (0..count).map(|k| RecordId(u128::from(incarnation) << 96 | u128::from(number) << 32 | u128::from(k)));
         let ids: Vec<_> = ids.collect();
+        farm.sent.borrow_mut().extend(&ids);
         let records: Vec<_> = ids.iter().map(|id| (Tag::level(1), record(*id, Vec3::X))).collect();
         let inserted = client::retry_for(Duration::MAX, || {
             let (mut cache, records) = (cache.clone(), &records);

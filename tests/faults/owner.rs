@@ -4,7 +4,7 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use cache_core::id::Digest;
-use cache_core::{Irradiance, Tag};
+use cache_core::{Irradiance, RecordId, Tag};
 use cache_proto::v1::frame_event::Event;
 use cache_proto::{VERSION, convert, v1};
 use tonic::Status;
@@ -49,6 +49,8 @@ enum End {
 /// The base a frame was begun with.
 struct Base {
     digest: Digest,
+    /// How often the disk had been lost when its frame was opened.
+    losses: u32,
     /// `None`: it could not be found out.
     records: Option<Vec<(Tag, Irradiance)>>,
 }
@@ -75,7 +77,7 @@ async fn render(farm: &Rc<Farm>, spec: &v1::FrameSpec) -> u64 {
     loop {
         match attempt(farm, spec, &mut base).await {
             End::Done(tiles, done) => {
-                check(spec, base, &tiles, &done);
+                check(farm, spec, base, &tiles, &done);
                 let count = |prefix: &str| -> f64 {
                     done.counts.iter().filter(|c| c.name.starts_with(prefix)).map(|c| c.value).sum()
                 };
@@ -87,14 +89,24 @@ async fn render(farm: &Rc<Farm>, spec: &v1::FrameSpec) -> u64 {
     }
 }
 
-fn check(spec: &v1::FrameSpec, base: Option<Base>, tiles: &[Vec<u8>], done: &v1::FrameDone) {
+fn check(farm: &Farm, spec: &v1::FrameSpec, base: Option<Base>, tiles: &[Vec<u8>], done: &v1::FrameDone) {
     events::note("owner", format_args!("done: {} records, {} leases lost", done.records, done.leases_lost));
     // Whoever opened it before the disk was lost and could not know the records cannot know the picture either.
-    let Some(records) = base.and_then(|base| base.records) else { return events::note("owner", "picture not checked") };
+    let Some(Base { records: Some(records), losses, .. }) = base else {
+        return events::note("owner", "picture not checked");
+    };
     let expected = reference(spec, &records);
     let all = (records.len() + expected.gathered.len()) as u64;
     if done.records != all {
         events::wrong(format_args!("a picture read {} records, expected {all}", done.records));
+    }
+    let disk = farm.disk.replica();
+    let durable = |id: &&RecordId| disk.set(&namespace(spec.levels)).is_some_and(|set| set.get(**id).is_some());
+    let published = expected.gathered.iter().filter(durable).count();
+    // What was told before the disk was lost may be heard after.
+    if published < expected.gathered.len() && losses == farm.disk.losses() {
+        let all = expected.gathered.len();
+        events::wrong(format_args!("a picture is done and {published} of its {all} records are published"));
     }
     if tiles != expected.tiles {
         events::wrong("a picture is not that of the reference");
@@ -177,8 +189,9 @@ fn opened_with(farm: &Rc<Farm>, spec: &v1::FrameSpec, base: &mut Option<Base>, o
         }
         events::note("owner", "the base is lost");
     }
-    if base.as_ref().is_none_or(|before| before.digest != digest) {
-        let records = farm.disk.prefix(&namespace(spec.levels), digest);
-        *base = Some(Base { digest, records });
+    let losses = farm.disk.losses();
+    match base {
+        Some(base) if base.digest == digest => base.losses = losses,
+        _ => *base = Some(Base { digest, losses, records: farm.disk.prefix(&namespace(spec.levels), digest) }),
     }
 }

@@ -100,6 +100,9 @@ pub struct Schedule {
     pub tiles: u32,
 }
 
+/// One more than the most faults.
+const FAULTS: usize = 14;
+
 /// Within this time faults begin, ms.
 const WINDOW: f32 = 12_000.0;
 
@@ -117,7 +120,7 @@ impl Schedule {
         let threads = 1 + below(2);
         let levels = if below(8) == 0 { 2 } else { 1 };
         let tiles = 1 + below(4) as u32;
-        let count = below(7);
+        let count = below(FAULTS);
         let mut faults: Vec<Planned> = Vec::new();
         for _ in 0..count {
             let hosts = hosts(owners, workers);

@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::rc::Rc;
 use std::time::Duration;
 
-use cache_core::Namespace;
+use cache_core::{Namespace, RecordId};
 use cache_proto::{convert, v1};
 use turmoil::Sim;
 use worker::client;
@@ -164,6 +164,7 @@ impl World {
                 self.farm.disk.lose();
                 let held = |id: &_| self.farm.is_held(&SHARED, *id);
                 self.farm.acknowledged.borrow_mut().retain(held);
+                self.farm.owed.replace(self.farm.sent.borrow().clone());
             }
             Fault::DiskFull => self.farm.disk.fill(true),
             Fault::ClockJump(by) => drop(self.farm.clock.send_replace(by)),
@@ -189,7 +190,10 @@ impl World {
                 network::mend(self.sim.lookup(host));
                 self.sim.bounce(host);
             }
-            Fault::DiskFull => self.farm.disk.fill(false),
+            Fault::DiskFull => {
+                self.check_kept();
+                self.farm.disk.fill(false);
+            }
             Fault::ClockJump(_) | Fault::Away => {}
         }
     }
@@ -226,13 +230,21 @@ impl World {
         }
     }
 
-    /// What was acknowledged is durable: this is the moment the disk is all there is.
+    /// What was acknowledged, or only shown to others, is on the disk. After one was lost the replicas need some time to
+    /// bring back what was on it.
     fn check_kept(&self) {
         let replica = self.farm.disk.replica();
         let kept = |id: &_| replica.set(&SHARED).is_some_and(|set| set.get(*id).is_some());
-        let lost = self.farm.acknowledged.borrow().iter().filter(|id| !kept(id)).count();
+        self.farm.owed.borrow_mut().retain(|id| !kept(id));
+        let owed = self.farm.owed.borrow();
+        let lost = self.farm.acknowledged.borrow().iter().filter(|id| !kept(id) && !owed.contains(id)).count();
         if lost > 0 {
             events::wrong(format_args!("{lost} acknowledged records are not on the disk"));
+        }
+        let early = |id: &&RecordId| !kept(id) && !owed.contains(id) && self.farm.is_shown(**id);
+        let early = self.farm.sent.borrow().iter().filter(early).count();
+        if early > 0 {
+            events::wrong(format_args!("{early} records are shown that are not on the disk"));
         }
     }
 
@@ -291,6 +303,8 @@ impl World {
     }
 
     fn check_acknowledged(&self) {
+        // By now all of it is back.
+        self.farm.owed.borrow_mut().clear();
         self.check_kept();
         let replicas = self.farm.replicas.borrow();
         let Some((_, follower)) = replicas.get(STEADY).and_then(|all| all.iter().find(|(n, _)| *n == SHARED)) else {

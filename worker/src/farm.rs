@@ -240,7 +240,12 @@ impl<J: Job> Worker<J> {
                 Ok(()) => {}
                 Err(Fault::Gone) => debug!(lease.id, "lease is gone"),
                 Err(Fault::Unfit(reason)) => {
-                    if let Err(status) = self.decline(lease.frame, reason).await {
+                    if let Err(status) = self.decline(lease.frame, reason, false).await {
+                        return status;
+                    }
+                }
+                Err(Fault::Hopeless(reason)) => {
+                    if let Err(status) = self.decline(lease.frame, reason, true).await {
                         return status;
                     }
                 }
@@ -249,12 +254,12 @@ impl<J: Job> Worker<J> {
         }
     }
 
-    async fn decline(&self, frame: u64, reason: String) -> Result<(), Status> {
+    async fn decline(&self, frame: u64, reason: String, for_all: bool) -> Result<(), Status> {
         if !lock(&self.declined).insert(frame) {
             return Ok(());
         }
         warn!(frame, reason, "declining");
-        let request = v1::DeclineRequest { worker: self.name.clone(), frame, reason };
+        let request = v1::DeclineRequest { worker: self.name.clone(), frame, reason, for_all };
         let declined = client::retry(|| {
             let (mut frames, request) = (self.frames.clone(), request.clone());
             async move { frames.decline(request).await }
@@ -276,6 +281,7 @@ impl<J: Job> Worker<J> {
         let work = Work { step: step.clone(), tiles, levels, known, dropped: dropped.clone() };
         let done = ready.job.clone().run(work).await.map_err(Fault::Unfit)?;
         let mut done = done.ok_or(Fault::Gone)?;
+        let worked_seconds = done.cpu_seconds;
         done.cpu_seconds += sealing_seconds;
         let bytes_records = self.insert(&ready.draft, &done.records, &dropped).await?;
         let request = v1::CompleteRequest {
@@ -285,6 +291,7 @@ impl<J: Job> Worker<J> {
             gathered: done.records.len() as u64,
             counts: done.counts(&step, bytes_records, ready.take_received()),
             tiles: done.tiles,
+            worked_seconds,
         };
         let completed = client::retry(|| {
             let (mut frames, request) = (self.frames.clone(), request.clone());
@@ -304,8 +311,8 @@ impl<J: Job> Worker<J> {
         described.await
     }
 
-    /// Inserts what a lease gathered; says how many bytes of records it sent. A server that has no room, or is away, is
-    /// asked again as long as the lease is ours.
+    /// Inserts what a lease gathered; says how many bytes of records it sent. A server whose disk is full, or that is
+    /// away, is asked again as long as the lease is ours; one that may keep no more records will not keep them later.
     async fn insert(&self, draft: &Namespace, records: &[(Tag, Irradiance)], dropped: &Dropped) -> Result<u64, Fault> {
         if records.is_empty() {
             return Ok(0);
@@ -319,7 +326,10 @@ impl<J: Job> Worker<J> {
             match inserted.await {
                 Ok(kept) => return Ok(kept.bytes),
                 Err(_) if dropped() => return Err(Fault::Gone),
-                Err(status) if follow::is_worth_repeating(&status) => warn!("records wait: {}", status.message()),
+                Err(status) if client::is_passing(&status) => warn!("records wait: {}", status.message()),
+                Err(status) if status.code() == Code::ResourceExhausted => {
+                    return Err(Fault::Hopeless(format!("the server refused records: {}", status.message())));
+                }
                 // The border found a record unsound: gathered again it would be the same.
                 Err(status) if status.code() == Code::InvalidArgument => {
                     return Err(Fault::Unfit(format!("the server refused records: {}", status.message())));

@@ -274,7 +274,7 @@ async fn refill(mut cache: Cache, namespace: Namespace, held: Arc<Mutex<Held>>, 
                     info!(records = records.len(), "gave back to the server");
                     (from, end, backoff) = (next, kept.position, Backoff::default());
                 }
-                Err(status) if is_worth_repeating(&status) => {
+                Err(status) if client::is_passing(&status) => {
                     debug!("{status}");
                     backoff.wait().await;
                 }
@@ -307,11 +307,6 @@ pub struct Kept {
     pub bytes: u64,
     /// Length of the server's log after them.
     pub position: u64,
-}
-
-/// Whether an insert that failed so may succeed later: the server is away, or has no room for now.
-pub fn is_worth_repeating(status: &Status) -> bool {
-    client::is_passing(status) || status.code() == Code::ResourceExhausted
 }
 
 /// Inserts records, each tag's in batches, and waits until the server keeps them. Repeating it is harmless.

@@ -30,6 +30,8 @@ pub enum Fault {
     Gone,
     /// This worker cannot do the frame, and why.
     Unfit(String),
+    /// Nobody can do the frame, and why.
+    Hopeless(String),
     /// The server.
     Server(Status),
 }

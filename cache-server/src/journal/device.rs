@@ -13,6 +13,10 @@ pub enum Sync {
     PageCache,
 }
 
+/// redb writes pages of a power of two, of which a value may fill little more than half. The zeros behind it are not
+/// written where the file has them already, in whole blocks of so many bytes.
+const BLOCK: usize = 4096;
+
 /// One file. Whoever opens it holds the directory's lock.
 #[derive(Debug)]
 pub(super) struct Device {
@@ -56,7 +60,34 @@ impl redb::StorageBackend for Device {
     fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {
         #[cfg(test)]
         tests::take(&self.room, data.len())?;
+        let used = data.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1);
+        let used = used.next_multiple_of(BLOCK).min(data.len());
+        if used < data.len() && self.is_hole(offset + used as u64, (data.len() - used) as u64) {
+            return self.file.write_all_at(&data[..used], offset);
+        }
         self.file.write_all_at(data, offset)
+    }
+}
+
+impl Device {
+    /// Whether nothing was ever written to a part of the file, so that it reads as zeros.
+    #[cfg(target_os = "linux")]
+    fn is_hole(&self, offset: u64, length: u64) -> bool {
+        use nix::errno::Errno;
+        use nix::unistd::{Whence, lseek};
+        // Nobody uses the position that this moves.
+        let Ok(from) = i64::try_from(offset) else { return false };
+        match lseek(&self.file, from, Whence::SeekData) {
+            Ok(data) => data as u64 >= offset + length,
+            // No data from there to the end, which may lie before it: then what is behind has to be written.
+            Err(Errno::ENXIO) => self.file.metadata().is_ok_and(|file| file.len() >= offset + length),
+            Err(_) => false,
+        }
+    }
+
+    #[cfg(not(target_os = "linux"))]
+    fn is_hole(&self, _: u64, _: u64) -> bool {
+        false
     }
 }
 

@@ -37,6 +37,8 @@ pub struct Disk {
     /// `None` after a failure: redb takes nothing more until it is opened again.
     database: Option<Database>,
     next: Place,
+    /// Where values are sealed.
+    value: Vec<u8>,
     _lock: File,
 }
 
@@ -58,7 +60,7 @@ impl Disk {
         let lock = lock(directory)?;
         let path = directory.join(FILE);
         let (database, next, report) = recovery::open(&path, sync)?;
-        Ok((Self { path, sync, database: Some(database), next, _lock: lock }, report))
+        Ok((Self { path, sync, database: Some(database), next, value: Vec::new(), _lock: lock }, report))
     }
 
     /// The database, opened again if an append failed.
@@ -82,9 +84,15 @@ impl Journal for Disk {
     fn append(&mut self, entries: &[Entry]) -> io::Result<()> {
         let groups = value::split(entries)?;
         self.database()?;
-        let mut next = self.next;
-        let values: Vec<_> = groups.into_iter().map(|group| (next.sequence, next.seal(group))).collect();
-        let written = write(self.database()?, values.iter().map(|(sequence, value)| (*sequence, value.as_slice())));
+        let (mut next, mut value) = (self.next, std::mem::take(&mut self.value));
+        let written = write(self.database()?, |table| {
+            groups.into_iter().try_for_each(|group| {
+                let sequence = next.sequence;
+                next.seal_into(&mut value, group);
+                table.insert(sequence, value.as_slice()).map(drop)
+            })
+        });
+        self.value = value;
         match written {
             Ok(()) => self.next = next,
             Err(_) => self.database = None,
@@ -144,17 +152,12 @@ pub(super) fn begin(database: &Database) -> Result<(), redb::Error> {
 }
 
 /// Adds values in one transaction.
-pub(super) fn write<'a>(
+pub(super) fn write(
     database: &Database,
-    values: impl IntoIterator<Item = (u64, &'a [u8])>,
+    insert: impl FnOnce(&mut redb::Table<'_, u64, &'static [u8]>) -> Result<(), redb::StorageError>,
 ) -> Result<(), redb::Error> {
     let transaction = database.begin_write()?;
-    {
-        let mut table = transaction.open_table(VALUES)?;
-        for (sequence, value) in values {
-            table.insert(sequence, value)?;
-        }
-    }
+    insert(&mut transaction.open_table(VALUES)?)?;
     Ok(transaction.commit()?)
 }
 

@@ -227,8 +227,10 @@ fn copy(from: &File, values: &[(u64, value::Header)], to: &Database, mut place: 
             let payload = salvage::payload(from, *at, header)?;
             sealed.push((place.sequence, place.seal_payload(header.records, &payload)));
         }
-        let values = sealed.iter().map(|(sequence, value)| (*sequence, value.as_slice()));
-        disk::write(to, values).map_err(disk::plain)?;
+        let insert = |table: &mut redb::Table<'_, u64, &'static [u8]>| {
+            sealed.iter().try_for_each(|(sequence, value)| table.insert(sequence, value.as_slice()).map(drop))
+        };
+        disk::write(to, insert).map_err(disk::plain)?;
     }
     Ok(place)
 }

@@ -137,14 +137,21 @@ pub struct Place {
 impl Place {
     /// Puts entries, as [`split`] groups them, into one value, and moves on to the place behind it.
     pub fn seal(&mut self, entries: &[v1::Entry]) -> Vec<u8> {
-        let mut value = Vec::with_capacity(HEADER + entries.iter().map(weight).sum::<usize>());
+        let mut value = Vec::new();
+        self.seal_into(&mut value, entries);
+        value
+    }
+
+    /// As [`Self::seal`], in the place of what `value` held: memory used before costs less than new memory.
+    pub fn seal_into(&mut self, value: &mut Vec<u8>, entries: &[v1::Entry]) {
+        value.clear();
+        value.reserve(HEADER + entries.iter().map(weight).sum::<usize>());
         value.resize(HEADER, 0);
         for entry in entries {
             // A vector grows: there is room.
-            let _ = entry.encode_length_delimited(&mut value);
+            let _ = entry.encode_length_delimited(value);
         }
-        self.head(entries.iter().map(records).sum(), &mut value);
-        value
+        self.head(entries.iter().map(records).sum(), value);
     }
 
     /// Puts a payload of at most [`PAYLOAD_MAX`] bytes that holds so many records into a value.

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use glam::{DVec3, Vec3};
 
+use super::rad::show;
 use super::{Camera, SceneError};
 
 /// What a line with a view begins with, after any path.
@@ -78,7 +79,7 @@ impl View {
             let mut number = || -> Result<f64, String> {
                 let text = words.next().ok_or_else(|| format!("{word} ends the line; expected its numbers"))?;
                 let value = text.parse().ok().filter(|v: &f64| v.is_finite());
-                value.ok_or_else(|| format!("{word} has `{}`; expected a finite number", clip(text)))
+                value.ok_or_else(|| format!("{word} has `{}`; expected a finite number", show(text.as_bytes())))
             };
             match word {
                 "-vtv" => self.parallel = false,
@@ -95,12 +96,12 @@ impl View {
                     }
                 }
                 _ if word.starts_with("-vt") => {
-                    return Err(format!("view type {} is not supported; expected -vtv or -vtl", clip(word)));
+                    return Err(format!("view type {} is not supported; expected -vtv or -vtl", show(word.as_bytes())));
                 }
                 _ => {
                     return Err(format!(
                         "view option {} is not supported; expected -vt -vp -vd -vu -vh -vv",
-                        clip(word)
+                        show(word.as_bytes())
                     ));
                 }
             }
@@ -122,11 +123,6 @@ impl View {
             self.parallel,
         )
     }
-}
-
-/// Enough of a word for a message.
-fn clip(word: &str) -> String {
-    word.chars().take(40).collect()
 }
 
 #[cfg(test)]
@@ -167,6 +163,8 @@ mod tests {
             ("rvu -vf other.vf\n", "FILE:1: view option -vf is not supported"),
             ("rvu -vp 1 2\n", "FILE:1: -vp ends the line"),
             ("rvu -vp 1 2 nan\n", "FILE:1: -vp has `nan`"),
+            ("rvu -vp 1 2 \u{17}3\n", "FILE:1: -vp has `\u{fffd}3`"),
+            ("rvu -\u{1b}[2J\n", "FILE:1: view option -\u{fffd}[2J is not supported"),
             ("rvu -vh 180\n", "FILE:1: horizontal view size"),
             ("rvu -vd 0 0 1 -vu 0 0 1\n", "FILE:1: view up must not be"),
             ("rvu -vp 1e300 0 0\n", "FILE:1: view point"),

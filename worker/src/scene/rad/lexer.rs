@@ -170,7 +170,7 @@ pub(super) fn finite(token: &[u8]) -> Option<f64> {
 }
 
 /// A name as messages show it: printable, and not longer than a message can bear.
-pub(super) fn show(name: &[u8]) -> String {
+pub(in crate::scene) fn show(name: &[u8]) -> String {
     let head = &name[..name.len().min(4 * SHOWN)];
     let text: Cow<str> = String::from_utf8_lossy(head);
     let mut shown: String =

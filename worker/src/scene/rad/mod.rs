@@ -17,7 +17,8 @@ mod xform;
 use std::fmt::{Arguments, Display};
 use std::path::{Path, PathBuf};
 
-use lexer::{Item, Lexer, show};
+pub(super) use lexer::show;
+use lexer::{Item, Lexer};
 use xform::{Frame, Xform};
 
 use super::{Scene, SceneError};
