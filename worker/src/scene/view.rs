@@ -164,7 +164,7 @@ mod tests {
             ("rvu -vp 1 2\n", "FILE:1: -vp ends the line"),
             ("rvu -vp 1 2 nan\n", "FILE:1: -vp has `nan`"),
             ("rvu -vp 1 2 \u{17}3\n", "FILE:1: -vp has `\u{fffd}3`"),
-            ("rvu -\u{1b}[2J\n", "FILE:1: view option -\u{fffd}[2J is not supported"),
+            ("rvu -v\u{1b}[2J\n", "FILE:1: view option -v\u{fffd}[2J is not supported"),
             ("rvu -vh 180\n", "FILE:1: horizontal view size"),
             ("rvu -vd 0 0 1 -vu 0 0 1\n", "FILE:1: view up must not be"),
             ("rvu -vp 1e300 0 0\n", "FILE:1: view point"),
