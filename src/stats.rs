@@ -94,6 +94,8 @@ impl Stats {
                 "total": whole(bytes + self.tile_bytes as f64),
             },
             "rounds": done.rounds,
+            "passes": done.passes,
+            "proposals": count("proposals"),
             "leases_lost": done.leases_lost,
             "workers": self.workers,
             "workers_lost": self.workers_lost,

@@ -1,7 +1,7 @@
 //! Records made up: sound, of real size, the same bits every time.
 
 use cache_core::id::{Digest, Origin, Random};
-use cache_core::{Cached as _, Irradiance, Namespace, Query, Tag};
+use cache_core::{Irradiance, Namespace, Packed as _, Query, Tag};
 use cache_proto::convert;
 use cache_proto::v1::RecordBatch;
 use glam::{Vec2, Vec3};

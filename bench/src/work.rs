@@ -85,6 +85,7 @@ pub fn spec(width: u32, height: u32) -> v1::FrameSpec {
         bounces: 2,
         seed: 0,
         levels: 2,
+        adaptive: false,
         effort: None,
     }
 }
@@ -129,7 +130,7 @@ impl Job for Pretended {
         if let Some((_, record)) = done.records.first() {
             let before = watch().made.fetch_add(done.records.len() as u64, Ordering::Relaxed);
             if (before + done.records.len() as u64) / WATCH_EVERY > before / WATCH_EVERY {
-                lock(&watch().watched).push((record.id, Instant::now()));
+                lock(&watch().watched).push((record.id(), Instant::now()));
             }
         }
         Ok(Some(done))
@@ -177,7 +178,7 @@ impl Pretended {
                 let site = [x as f32, y as f32, level as f32, pass as f32];
                 micros += self.gather * 0.25 * 16f32.powf(uniform(&[x, y, level, pass, 1])) * 0.74;
                 // Of a level nobody seals here; see `levels`.
-                done.records.push((Tag { level: 2, step }, records::at(&site, 0.01)));
+                done.records.push((Tag { level: 2, step }, records::at(&site, 0.01).into()));
             }
         }
         micros

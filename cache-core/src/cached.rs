@@ -1,11 +1,10 @@
 //! The first door: what every kind of record must be able to do.
 //!
 //! A room behind it says how its record is laid out, whether one is sound, how much it counts at a query and what it
-//! adds to the answer. Filing, clamping, merging and sealing are the same for all rooms and live outside.
+//! adds to the answer. Filing, clamping, shrinking, merging and sealing are the same for all rooms and live outside.
 
 use glam::Vec3;
 
-use crate::details::Weighting;
 use crate::id::RecordId;
 
 /// Where an answer is wanted: a point and its unit normal.
@@ -17,7 +16,7 @@ pub struct Query {
     pub normal: Vec3,
 }
 
-/// What makes a record unfit to be kept. Checked in one place, [`Cached::decode`], whoever sent the bytes.
+/// What makes a record unfit to be kept. Checked in one place, [`Packed::decode`], whoever sent the bytes.
 #[derive(Clone, Copy, PartialEq, Debug, thiserror::Error)]
 pub enum Invalid {
     /// Not a whole number of records.
@@ -40,6 +39,9 @@ pub enum Invalid {
         /// Its length.
         length: f32,
     },
+    /// An id that does not belong to the rest.
+    #[error("id is not that of the content")]
+    Id,
     /// A field outside its range.
     #[error("{field} is {value}, expected {expected}")]
     Range {
@@ -52,32 +54,15 @@ pub enum Invalid {
     },
 }
 
-/// A kind of record. Records are immutable: what changes later (the clamped R, a) is derived and kept outside.
-pub trait Cached: Clone + Send + Sync + 'static {
+/// A kind of record as it is kept and sent: an identity and bytes.
+pub trait Packed: Copy + Send + Sync + 'static {
     /// Number of the kind on the wire; never re-used.
     const KIND: u32;
     /// Bytes of one packed record.
     const BYTES: usize;
-    /// What a query gets.
-    type Answer: Clone + Default;
 
     /// Identity.
     fn id(&self) -> RecordId;
-    /// The site's position.
-    fn position(&self) -> Vec3;
-    /// R_i at birth: distance to the surroundings, world length, before any clamping. Positive, may be infinite.
-    fn radius(&self) -> f32;
-    /// Least and greatest R the record may count with, world lengths; both finite and positive.
-    fn radius_bounds(&self) -> (f32, f32);
-
-    /// Weight at a query for the clamped and bounded `radius` and the allowed error `a`; at most 0: does not count.
-    /// Must be 0 or less wherever `query` is farther than `a * radius` from the site.
-    fn weight(&self, query: &Query, radius: f32, a: f32, weighting: Weighting) -> f32;
-    /// Adds this record's estimate at `query`, times `weight`, to `answer`. `limit` in [0, 1] scales gradients where
-    /// the record counts farther than its R allows extrapolation.
-    fn add(&self, query: &Query, weight: f32, limit: f32, answer: &mut Self::Answer);
-    /// Divides the sum by the weights.
-    fn finish(answer: &mut Self::Answer, weights: f32);
 
     /// Appends the record's [`Self::BYTES`] bytes.
     fn encode(&self, bytes: &mut Vec<u8>);
@@ -86,4 +71,27 @@ pub trait Cached: Clone + Send + Sync + 'static {
     /// # Errors
     /// What is unsound about it.
     fn decode(bytes: &[u8]) -> Result<Self, Invalid>;
+}
+
+/// A kind of record that answers. Records are immutable: what changes later (the clamped R, a) is derived and kept outside.
+pub trait Cached: Packed {
+    /// What a query gets.
+    type Answer: Clone + Default;
+
+    /// The site's position.
+    fn position(&self) -> Vec3;
+    /// R_i at birth: distance to the surroundings, world length, before any clamping. Positive, may be infinite.
+    fn radius(&self) -> f32;
+    /// Least and greatest R the record may count with, world lengths; both finite and positive.
+    fn radius_bounds(&self) -> (f32, f32);
+
+    /// Relative error e_i at a query for the clamped and bounded `radius`; the record counts where it is below the allowed
+    /// error `a`, and nothing needs to be known of it where it is not. At least the query's distance over `radius`;
+    /// infinite where the record must not count.
+    fn error(&self, query: &Query, radius: f32, a: f32) -> f32;
+    /// Adds this record's estimate at `query`, times `weight`, to `answer`. `limit` in [0, 1] scales gradients where
+    /// the record counts farther than its R allows extrapolation.
+    fn add(&self, query: &Query, weight: f32, limit: f32, answer: &mut Self::Answer);
+    /// Divides the sum by the weights.
+    fn finish(answer: &mut Self::Answer, weights: f32);
 }

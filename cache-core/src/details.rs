@@ -46,6 +46,24 @@ pub enum Weighting {
     InverseToZero,
 }
 
+/// Errors count as at least this part of the allowed one, so that a query on the site itself stays finite.
+const ERROR_MIN: f32 = 1e-4;
+
+impl Weighting {
+    /// Weight at relative error `error` where `a` is allowed; more than 0 where it is less, else at most 0.
+    #[inline]
+    pub fn weight(self, error: f32, a: f32) -> f32 {
+        if error >= a {
+            return 0.0;
+        }
+        match self {
+            Self::Inverse => 1.0 / error.max(ERROR_MIN * a),
+            Self::Linear => 1.0 - error / a,
+            Self::InverseToZero => 1.0 / error.max(ERROR_MIN * a) - 1.0 / a,
+        }
+    }
+}
+
 /// What keeps records from crowding in corners.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Spacing {
@@ -80,6 +98,8 @@ pub struct Details {
     pub weighting: Weighting,
     /// Least reach.
     pub spacing: Spacing,
+    /// Whether records shrink where they make visible steps (Krivanek 2006, 4).
+    pub adaptive: bool,
 }
 
 impl Default for Details {
@@ -95,6 +115,7 @@ impl Default for Details {
             neighbor_clamping: true,
             weighting: Weighting::InverseToZero,
             spacing: Spacing::Pixels,
+            adaptive: false,
         }
     }
 }

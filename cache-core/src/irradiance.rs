@@ -11,8 +11,7 @@
 
 use glam::{Vec2, Vec3};
 
-use crate::cached::{Cached, Invalid, Query};
-use crate::details::Weighting;
+use crate::cached::{Cached, Invalid, Packed, Query};
 use crate::id::RecordId;
 use crate::math::{Frame, Rgb};
 
@@ -58,17 +57,8 @@ pub struct Answer {
 /// Wire and memory order of the float fields after the id.
 const FLOATS: usize = 28;
 
-/// Weights are kept below this, so that a query on the site itself stays finite.
-const ERROR_MIN: f32 = 1e-4;
-
 impl Cached for Irradiance {
-    const KIND: u32 = 1;
-    const BYTES: usize = 16 + 4 * FLOATS;
     type Answer = Answer;
-
-    fn id(&self) -> RecordId {
-        self.id
-    }
 
     fn position(&self) -> Vec3 {
         self.position
@@ -85,32 +75,24 @@ impl Cached for Irradiance {
     /// The error e is that of Ward 1988 eq. 5, or the ellipse's where that says more. A record in front of the query (Ward
     /// 1988 eq. 6) does not count; the test's tolerance scales with R.
     #[inline]
-    fn weight(&self, query: &Query, radius: f32, a: f32, weighting: Weighting) -> f32 {
+    fn error(&self, query: &Query, radius: f32, a: f32) -> f32 {
         let offset = query.position - self.position;
         let mut translation = offset.length() / radius;
         // sqrt(1 - n·n_i) without its cancellation: |n - n_i|² = 2 (1 - n·n_i) for unit vectors.
         let rotation = (query.normal - self.normal).length() * std::f32::consts::FRAC_1_SQRT_2;
         if translation + rotation >= a {
-            return 0.0;
+            return f32::INFINITY;
         }
         let [xx, xy, yy] = self.ellipse;
         if xx + yy > 0.0 {
             let Vec2 { x, y } = Frame::around(self.normal).tangential(offset);
             translation = translation.max((x * x * xx + 2.0 * x * y * xy + y * y * yy).max(0.0).sqrt());
         }
-        let error = translation + rotation;
-        if error >= a {
-            return 0.0;
-        }
         let behind = offset.dot(query.normal + self.normal) * 0.5;
         if behind < -IN_FRONT_TOLERANCE * radius {
-            return 0.0;
+            return f32::INFINITY;
         }
-        match weighting {
-            Weighting::Inverse => 1.0 / error.max(ERROR_MIN),
-            Weighting::Linear => 1.0 - error / a,
-            Weighting::InverseToZero => 1.0 / error.max(ERROR_MIN) - 1.0 / a,
-        }
+        translation + rotation
     }
 
     /// Ward 1992 eq. 6: E_i + (n_i × n)·∇_r E_i + (p - p_i)·∇_t E_i, never below 0.
@@ -129,6 +111,15 @@ impl Cached for Irradiance {
     fn finish(answer: &mut Answer, weights: f32) {
         answer.irradiance /= weights;
         answer.noise = answer.noise.sqrt() / weights;
+    }
+}
+
+impl Packed for Irradiance {
+    const KIND: u32 = 1;
+    const BYTES: usize = 16 + 4 * FLOATS;
+
+    fn id(&self) -> RecordId {
+        self.id
     }
 
     fn encode(&self, bytes: &mut Vec<u8>) {
@@ -287,6 +278,7 @@ impl Irradiance {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::details::Weighting;
 
     pub(crate) fn sound() -> Irradiance {
         Irradiance {
@@ -348,7 +340,7 @@ mod tests {
     fn weight_falls_to_zero_at_the_border_and_excludes_what_lies_behind() {
         let r = sound();
         let at = |offset: Vec3| Query { position: r.position + offset, normal: r.normal };
-        let weight = |query: &Query| r.weight(query, 2.0, 0.3, Weighting::InverseToZero);
+        let weight = |query: &Query| Weighting::InverseToZero.weight(r.error(query, 2.0, 0.3), 0.3);
         assert!(weight(&at(Vec3::X * 0.5)) > 0.0);
         assert!(weight(&at(Vec3::X * 0.599)) < 0.01);
         assert_eq!(weight(&at(Vec3::X * 0.601)), 0.0);
@@ -366,7 +358,7 @@ mod tests {
         let r = Irradiance { ellipse: [1.0, 0.0, 1.0 / 16.0], ..sound() };
         let reaches = |offset: Vec3| {
             let query = Query { position: r.position + offset, normal: r.normal };
-            r.weight(&query, 2.0, 0.3, Weighting::Linear) > 0.0
+            r.error(&query, 2.0, 0.3) < 0.3
         };
         assert!(reaches(frame.x * 0.29) && !reaches(frame.x * 0.31));
         assert!(reaches(frame.y * 0.59) && !reaches(frame.y * 0.61));

@@ -7,6 +7,8 @@
 //! - [`cached`]: the first door: what every kind of record must be able to do.
 //! - [`irradiance`]: the room of irradiance: record, weights, gradients, interpolation (Ward 1988, 1992).
 //! - [`null`]: the empty room that proves the door.
+//! - [`shrink`]: a proposal that a record count less far (Krivanek 2006).
+//! - [`record`]: a record of any kind.
 //! - [`hemisphere`]: stratified directions of a gather, and what their samples say: E, both gradients, R.
 //! - [`set`]: id to record, union is the only merge; with its order-free digest.
 //! - [`clamp`]: neighbor clamping in its order-free form (Krivanek 2006).
@@ -21,6 +23,9 @@ pub mod id;
 pub mod cached;
 pub mod irradiance;
 pub mod null;
+pub mod shrink;
+
+pub mod record;
 
 pub mod details;
 pub mod hemisphere;
@@ -33,9 +38,11 @@ pub mod set;
 
 pub mod rounds;
 
-pub use cached::{Cached, Invalid, Query};
+pub use cached::{Cached, Invalid, Packed, Query};
 pub use id::{Namespace, RecordId};
 pub use irradiance::Irradiance;
 pub use math::Rgb;
+pub use record::Record;
 pub use sealed::Sealed;
 pub use set::{RecordSet, Tag};
+pub use shrink::Shrink;

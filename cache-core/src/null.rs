@@ -3,8 +3,7 @@
 
 use glam::Vec3;
 
-use crate::cached::{Cached, Invalid, Query};
-use crate::details::Weighting;
+use crate::cached::{Cached, Invalid, Packed, Query};
 use crate::id::RecordId;
 
 /// A record without content.
@@ -19,14 +18,8 @@ pub struct Null {
 }
 
 impl Cached for Null {
-    const KIND: u32 = 0;
-    const BYTES: usize = 32;
     /// How many records count at the query.
     type Answer = u32;
-
-    fn id(&self) -> RecordId {
-        self.id
-    }
 
     fn position(&self) -> Vec3 {
         self.position
@@ -40,8 +33,8 @@ impl Cached for Null {
         (1e-18, 1e18)
     }
 
-    fn weight(&self, query: &Query, radius: f32, a: f32, _weighting: Weighting) -> f32 {
-        a * radius - query.position.distance(self.position)
+    fn error(&self, query: &Query, radius: f32, _: f32) -> f32 {
+        query.position.distance(self.position) / radius
     }
 
     fn add(&self, _: &Query, _: f32, _: f32, answer: &mut u32) {
@@ -49,6 +42,15 @@ impl Cached for Null {
     }
 
     fn finish(_: &mut u32, _: f32) {}
+}
+
+impl Packed for Null {
+    const KIND: u32 = 0;
+    const BYTES: usize = 32;
+
+    fn id(&self) -> RecordId {
+        self.id
+    }
 
     fn encode(&self, bytes: &mut Vec<u8>) {
         bytes.extend_from_slice(&self.id.0.to_le_bytes());

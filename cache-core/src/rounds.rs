@@ -30,7 +30,14 @@ const ROUNDS_LATER: u32 = 8;
 /// Rounds of a pass that looks again: it only finds what clamping has uncovered since.
 const ROUNDS_AGAIN: u32 = 2;
 
-/// Passes before the plan gives up on a level's last holes; Krivanek 2006 needed at most 11.
+/// Ranks of the first round of a pass that refines; each round goes twice as far as the one before it. What shrank left
+/// holes of many pixels.
+const REFINING_FROM: u32 = RANKS / 64;
+
+/// Most passes that refine; Krivanek 2006 needed at most 11.
+pub const REFINING_MAX: u32 = 11;
+
+/// Passes before the plan gives up on a level's last holes.
 pub const PASSES_MAX: u32 = 16;
 
 /// Rank of a pixel: bits of x^y and y interleaved, finest differences first.
@@ -60,6 +67,12 @@ pub fn look(level: u32, pass: u32) -> u32 {
     pass % looks(level)
 }
 
+/// Whether a pass of an adaptive plan also looks for visible steps between records (Krivanek 2006, Algorithm 1): at level
+/// 1, when every look has been filled once.
+pub fn refines(level: u32, pass: u32) -> bool {
+    level == 1 && (LOOKS..LOOKS + REFINING_MAX).contains(&pass)
+}
+
 fn looks(level: u32) -> u32 {
     if level == 1 { LOOKS } else { LOOKS_DEEPER }
 }
@@ -68,6 +81,7 @@ fn looks(level: u32) -> u32 {
 /// nothing, then the pixels.
 #[derive(Clone, Debug)]
 pub struct Plan {
+    adaptive: bool,
     level: u32,
     pass: u32,
     /// Passes in a row that gathered nothing.
@@ -78,19 +92,21 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// A plan for `levels` levels of records (0: pixels only).
-    pub fn new(levels: u32) -> Self {
-        Self { level: levels, pass: 0, quiet: 0, from: 0, gathered: 0, done: false }
+    /// A plan for `levels` levels of records (0: pixels only); an adaptive one has passes that refine.
+    pub fn new(levels: u32, adaptive: bool) -> Self {
+        Self { adaptive, level: levels, pass: 0, quiet: 0, from: 0, gathered: 0, done: false }
     }
 
-    /// The next step, told how many records the previous one gathered (0 before the first); `None` when all is done.
+    /// The next step, told how many records and proposals the previous one made (0 before the first); `None` when all is
+    /// done.
     pub fn next(&mut self, gathered: u64) -> Option<Step> {
         self.gathered += gathered;
         if self.level > 0 && self.from == RANKS {
             self.from = 0;
             self.pass += 1;
-            self.quiet = if self.gathered == 0 { self.quiet + 1 } else { 0 };
-            if self.quiet == looks(self.level) || self.pass == PASSES_MAX {
+            let unrefined = self.adaptive && self.level == 1 && self.pass <= LOOKS;
+            self.quiet = if self.gathered == 0 && !unrefined { self.quiet + 1 } else { 0 };
+            if self.quiet == looks(self.level) || self.pass == self.passes_max() {
                 (self.pass, self.quiet) = (0, 0);
                 self.level -= 1;
             }
@@ -104,10 +120,17 @@ impl Plan {
         (!std::mem::replace(&mut self.done, true)).then_some(Step::Pixels)
     }
 
+    fn passes_max(&self) -> u32 {
+        // The holes the last shrinking left are filled, too.
+        if self.adaptive && self.level == 1 { LOOKS + REFINING_MAX + LOOKS } else { PASSES_MAX }
+    }
+
     fn round_end(&self) -> u32 {
+        let refining = self.adaptive && self.level == 1;
         let end = match self.pass {
             0 => ((self.from as f32 * GROWTH) as u32).max(self.from + 1),
             pass if pass < looks(self.level) => self.from + RANKS / ROUNDS_LATER,
+            _ if refining => (2 * self.from).max(REFINING_FROM),
             _ => self.from + RANKS / ROUNDS_AGAIN,
         };
         end.min(RANKS)
@@ -134,8 +157,11 @@ mod tests {
         }
     }
 
-    fn steps(levels: u32, mut gathered: impl FnMut(&Step) -> u64) -> Vec<Step> {
-        let mut plan = Plan::new(levels);
+    fn steps(levels: u32, gathered: impl FnMut(&Step) -> u64) -> Vec<Step> {
+        all_steps(Plan::new(levels, false), gathered)
+    }
+
+    fn all_steps(mut plan: Plan, mut gathered: impl FnMut(&Step) -> u64) -> Vec<Step> {
         let (mut all, mut last) = (Vec::new(), 0);
         while let Some(step) = plan.next(last) {
             last = gathered(&step);
@@ -184,5 +210,28 @@ mod tests {
         assert_eq!(passes(&steps(1, found)), LOOKS as usize);
         let found = |step: &Step| u64::from(matches!(step, Step::Fill { pass: 0 | 2 | 5, .. }));
         assert_eq!(passes(&steps(1, found)), 6 + LOOKS as usize);
+    }
+
+    #[test]
+    fn an_adaptive_plan_refines_level_1_until_every_look_is_quiet() {
+        let passes = |level: u32, found: &dyn Fn(&Step) -> u64| {
+            let all = all_steps(Plan::new(2, true), found);
+            let pass = |step: &Step| match step {
+                Step::Fill { level: l, pass, ranks } if *l == level && ranks.start == 0 => Some(*pass),
+                _ => None,
+            };
+            all.iter().filter_map(pass).collect::<Vec<_>>()
+        };
+        let refining = |passes: &[u32], level| passes.iter().filter(|pass| refines(level, **pass)).count() as u32;
+        let nothing = passes(1, &|_| 0);
+        // Looks that were not refined say nothing about steps.
+        assert_eq!((nothing.len() as u32, refining(&nothing, 1)), (2 * LOOKS, LOOKS));
+        assert_eq!(passes(2, &|_| 0).len() as u32, LOOKS_DEEPER);
+        let once = passes(1, &|step| u64::from(matches!(step, Step::Fill { pass: 5, .. })));
+        assert_eq!(refining(&once, 1), 2 + LOOKS);
+        // Without end, the holes of the last shrinking are still filled.
+        let always = passes(1, &|_| 1);
+        assert_eq!((always.len() as u32, refining(&always, 1)), (2 * LOOKS + REFINING_MAX, REFINING_MAX));
+        assert!(always[always.len() - LOOKS as usize..].iter().all(|pass| !refines(1, *pass)));
     }
 }

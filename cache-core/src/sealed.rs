@@ -3,6 +3,7 @@
 //! Everything here is derived from the records and `a` alone: two replicas with the same set answer with the same bits,
 //! whatever order the records came in. Asking never writes.
 
+use hashbrown::HashMap;
 use smallvec::SmallVec;
 
 use crate::cached::{Cached, Query};
@@ -10,14 +11,21 @@ use crate::clamp::Clamp;
 use crate::details::Details;
 use crate::id::{Digest, RecordId};
 use crate::octree::Octree;
+use crate::record::Record;
+use crate::shrink::Shrink;
 
-/// Records of one level, clamped and filed.
+/// A new record's allowed error over its nearest neighbour's (Krivanek 2006, 4.2).
+const FIRST_OVER_NEAREST: f32 = 1.4;
+
+/// Records of one level, clamped, shrunk and filed.
 #[derive(Clone, Debug)]
 pub struct Sealed<C> {
     a: f32,
     details: Details,
     records: Vec<C>,
     derived: Vec<Derived>,
+    /// Least allowed error proposed for each record, those that are not here (yet) included.
+    proposed: HashMap<RecordId, f32>,
     octree: Octree,
     digest: Digest,
 }
@@ -31,15 +39,23 @@ struct Derived {
     radius: f32,
     /// How much of the gradients holds out to `radius`: R* / R where the lower bound stretched it, else 1.
     limit: f32,
+    /// a_i: the least of the global a and what was proposed.
+    a: f32,
 }
 
-impl Derived {
-    fn new<C: Cached>(record: &C, clamped: f32, details: &Details) -> Self {
-        let (min, max) = record.radius_bounds();
-        let radius = clamped.min(max).max(min);
-        let limit = if details.gradient_by_radius { (clamped / radius).min(1.0) } else { 1.0 };
-        Self { clamped, radius, limit }
-    }
+/// What one record says at a query.
+#[derive(Clone, Debug)]
+pub struct Contribution<C: Cached> {
+    /// Which.
+    pub record: C,
+    /// Its relative error there, below its a_i.
+    pub error: f32,
+    /// Least a_i it can have: its reach is then the least.
+    pub a_min: f32,
+    /// Its weight, more than 0.
+    pub weight: f32,
+    /// Its estimate.
+    pub answer: C::Answer,
 }
 
 impl<C: Cached> Sealed<C> {
@@ -50,8 +66,8 @@ impl<C: Cached> Sealed<C> {
 
     /// The same with other details than the usual ones.
     pub fn with(a: f32, details: Details) -> Self {
-        let (records, derived, octree) = (Vec::new(), Vec::new(), Octree::default());
-        Self { a, details, records, derived, octree, digest: Digest::default() }
+        let (records, derived, proposed) = (Vec::new(), Vec::new(), HashMap::new());
+        Self { a, details, records, derived, proposed, octree: Octree::default(), digest: Digest::default() }
     }
 
     /// Opens the set, adds records that are not in it yet, and seals it again. The result depends on the united set
@@ -67,29 +83,79 @@ impl<C: Cached> Sealed<C> {
             Clamp::new(records.iter().map(|r| (r.position(), r.radius())).collect())
         };
         let (all, fresh) = (clamps(&self.records), clamps(&self.records[known..]));
-        for (record, derived) in self.records.iter().zip(&mut self.derived) {
-            let clamped = fresh.clamp(record.position(), derived.clamped);
-            if clamped < derived.clamped {
-                *derived = Derived::new(record, clamped, &self.details);
+        for i in 0..known {
+            let clamped = fresh.clamp(self.records[i].position(), self.derived[i].clamped);
+            if clamped < self.derived[i].clamped {
+                self.derived[i] = self.derive(&self.records[i], clamped);
             }
         }
         for (i, record) in self.records.iter().enumerate().skip(known) {
             let (min, max) = record.radius_bounds();
-            // Filed by the greatest reach the record can ever have, so that clamping never moves it.
+            // Filed by the greatest reach the record can ever have, so that neither clamping nor shrinking moves it.
             self.octree.insert(i as u32, record.position(), self.a * record.radius().min(max).max(min));
             let clamped = all.clamp(record.position(), record.radius());
-            self.derived.push(Derived::new(record, clamped, &self.details));
+            self.derived.push(self.derive(record, clamped));
             self.digest.add(record.id());
         }
+    }
+
+    /// Opens the set, adds proposals that are not in it yet, of records that may come later, and seals it again. Neither their
+    /// order matters nor whether they come before or after their records.
+    pub fn shrink(&mut self, new: impl IntoIterator<Item = Shrink>) {
+        let mut lower = false;
+        for shrink in new {
+            self.digest.add(shrink.id);
+            let least = self.proposed.entry(shrink.of).or_insert(f32::INFINITY);
+            if shrink.a < *least {
+                (*least, lower) = (shrink.a, true);
+            }
+        }
+        if lower {
+            for i in 0..self.records.len() {
+                self.derived[i] = self.derive(&self.records[i], self.derived[i].clamped);
+            }
+        }
+    }
+
+    /// [`Self::extend`] and [`Self::shrink`] in one: what is of neither kind is left out.
+    pub fn unite<'a>(&mut self, new: impl IntoIterator<Item = &'a Record>)
+    where
+        C: TryFrom<Record>,
+    {
+        let (mut records, mut shrinks) = (Vec::new(), Vec::new());
+        for record in new {
+            match record {
+                Record::Shrink(shrink) => shrinks.push(*shrink),
+                other => records.extend(C::try_from(*other).ok()),
+            }
+        }
+        self.extend(records);
+        self.shrink(shrinks);
+    }
+
+    fn derive(&self, record: &C, clamped: f32) -> Derived {
+        let (min, max) = record.radius_bounds();
+        let radius = clamped.min(max).max(min);
+        let limit = if self.details.gradient_by_radius { (clamped / radius).min(1.0) } else { 1.0 };
+        let proposed = if self.proposed.is_empty() { None } else { self.proposed.get(&record.id()) };
+        // Whatever was proposed, the record counts out to the least reach.
+        let a = proposed.map_or(self.a, |proposed| proposed.max(self.a * min / radius).min(self.a));
+        Derived { clamped, radius, limit, a }
+    }
+
+    /// Relative error and weight of a record at a query.
+    #[inline]
+    fn weigh(&self, i: usize, query: &Query) -> (f32, f32) {
+        let Derived { radius, a, .. } = self.derived[i];
+        let error = self.records[i].error(query, radius, a);
+        (error, self.details.weighting.weight(error, a))
     }
 
     /// Whether any record counts at `query`.
     pub fn covers(&self, query: &Query) -> bool {
         let mut found = false;
         self.octree.visit(query.position, |i| {
-            found =
-                self.records[i as usize].weight(query, self.derived[i as usize].radius, self.a, self.details.weighting)
-                    > 0.0;
+            found = self.weigh(i as usize, query).1 > 0.0;
             !found
         });
         found
@@ -100,7 +166,7 @@ impl<C: Cached> Sealed<C> {
         let mut near: SmallVec<[(RecordId, u32, f32); 32]> = SmallVec::new();
         self.octree.visit(query.position, |i| {
             let record = &self.records[i as usize];
-            let weight = record.weight(query, self.derived[i as usize].radius, self.a, self.details.weighting);
+            let (_, weight) = self.weigh(i as usize, query);
             if weight > 0.0 {
                 near.push((record.id(), i, weight));
             }
@@ -119,6 +185,39 @@ impl<C: Cached> Sealed<C> {
         Some(answer)
     }
 
+    /// What each record that counts at `query` says there, in id order.
+    pub fn contributions(&self, query: &Query) -> SmallVec<[Contribution<C>; 8]> {
+        let mut near = SmallVec::new();
+        self.octree.visit(query.position, |i| {
+            let (record, derived) = (self.records[i as usize], &self.derived[i as usize]);
+            let (error, weight) = self.weigh(i as usize, query);
+            if weight > 0.0 {
+                let mut answer = C::Answer::default();
+                record.add(query, 1.0, derived.limit, &mut answer);
+                let a_min = self.a * record.radius_bounds().0 / derived.radius;
+                near.push(Contribution { record, error, a_min, weight, answer });
+            }
+            true
+        });
+        near.sort_unstable_by_key(|n: &Contribution<C>| n.record.id());
+        near
+    }
+
+    /// The allowed error a record made at `query` should begin with (Krivanek 2006, 4.2): 1.4 times that of the nearest
+    /// record that would count there had it not shrunk, at most the global a.
+    pub fn first_a(&self, query: &Query) -> f32 {
+        let mut nearest = (f32::INFINITY, RecordId(0), self.a);
+        self.octree.visit(query.position, |i| {
+            let (record, derived) = (&self.records[i as usize], &self.derived[i as usize]);
+            let error = record.error(query, derived.radius, self.a);
+            if error < self.a && (error, record.id()) < (nearest.0, nearest.1) {
+                nearest = (error, record.id(), derived.a);
+            }
+            true
+        });
+        (FIRST_OVER_NEAREST * nearest.2).min(self.a)
+    }
+
     /// Records in the set.
     pub fn len(&self) -> usize {
         self.records.len()
@@ -129,7 +228,7 @@ impl<C: Cached> Sealed<C> {
         self.records.is_empty()
     }
 
-    /// Order-free digest of the ids.
+    /// Order-free digest of the ids of records and proposals.
     pub fn digest(&self) -> Digest {
         self.digest
     }
@@ -167,16 +266,25 @@ mod tests {
         fn answers_do_not_depend_on_order_or_steps(
             mut records in prop::collection::vec(irradiance(), 1..60),
             points in prop::collection::vec(prop::array::uniform3(0f32..2.0), 20),
+            proposed in prop::collection::vec((0usize..70, 0.01f32..1.0), 0..60),
             cut in 0usize..60,
         ) {
+            // Some are of records that never come.
+            let of = |i: usize| records.get(i).map_or(RecordId(i as u128), |r| r.id);
+            let mut shrinks: Vec<_> = proposed.iter().map(|(i, a)| Shrink::new(of(*i), *a)).collect();
             let mut at_once = Sealed::new(0.8);
             at_once.extend(records.iter().copied());
+            at_once.shrink(shrinks.iter().copied());
             let middle = cut % records.len();
             records.rotate_left(middle);
+            shrinks.reverse();
             let mut in_steps = Sealed::new(0.8);
+            let mut shrinks = shrinks.chunks(5);
             for step in records.chunks(7) {
+                in_steps.shrink(shrinks.next().unwrap_or_default().iter().copied());
                 in_steps.extend(step.iter().copied());
             }
+            in_steps.shrink(shrinks.flatten().copied());
             prop_assert_eq!(at_once.digest(), in_steps.digest());
             for p in points {
                 let query = Query { position: Vec3::from(p), normal: Vec3::Z };
@@ -184,8 +292,52 @@ mod tests {
                 prop_assert_eq!(a.map(|a| a.irradiance.to_array().map(f32::to_bits)),
                                 b.map(|b| b.irradiance.to_array().map(f32::to_bits)));
                 prop_assert_eq!(a.is_some(), at_once.covers(&query));
+                let near = at_once.contributions(&query);
+                prop_assert_eq!(near.len(), a.map_or(0, |a| a.records as usize));
+                prop_assert_eq!(at_once.first_a(&query).to_bits(), in_steps.first_a(&query).to_bits());
+            }
+            for record in &records {
+                let site = Query { position: record.position, normal: record.normal };
+                prop_assert!(at_once.covers(&site));
             }
         }
+
+        /// The weakest shrink that excludes a point.
+        #[test]
+        fn an_error_proposed_excludes_there_and_no_nearer(
+            records in prop::collection::vec(irradiance(), 1..20),
+            points in prop::collection::vec(prop::array::uniform3(0f32..2.0), 20),
+        ) {
+            let mut sealed = Sealed::new(0.8);
+            sealed.extend(records.iter().copied());
+            for p in points {
+                let query = Query { position: Vec3::from(p), normal: Vec3::Z };
+                let near = sealed.contributions(&query);
+                for c in near.iter().filter(|c| c.error > c.a_min) {
+                    let counts = |a: f32| {
+                        let mut shrunk = sealed.clone();
+                        shrunk.shrink([Shrink::new(c.record.id, a)]);
+                        shrunk.contributions(&query).iter().any(|other| other.record.id == c.record.id)
+                    };
+                    prop_assert!(!counts(c.error) && counts(c.error * 1.0001));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_new_record_begins_with_a_little_more_than_the_nearest_that_shrank() {
+        let null = |id, x| Null { id: RecordId(id), position: Vec3::X * x, radius: 1.0 };
+        let mut sealed = Sealed::new(1.0);
+        sealed.extend([null(1, 0.0), null(2, 0.5)]);
+        let at = |x| Query { position: Vec3::X * x, normal: Vec3::Z };
+        assert_eq!(sealed.first_a(&at(0.3)), 1.0);
+        sealed.shrink([Shrink::new(RecordId(1), 0.1), Shrink::new(RecordId(2), 0.2), Shrink::new(RecordId(1), 0.3)]);
+        assert!(!sealed.covers(&at(0.2)) && sealed.covers(&at(0.09)) && sealed.covers(&at(0.31)));
+        assert_eq!([0.2, 0.3, 7.0].map(|x| sealed.first_a(&at(x))), [1.4 * 0.1, 1.4 * 0.2, 1.0]);
+        // Nothing lets a record count less far than its least R.
+        sealed.shrink([Shrink::new(RecordId(1), 1e-30)]);
+        assert!(sealed.covers(&at(0.0)));
     }
 
     #[test]

@@ -6,8 +6,8 @@ use std::hash::BuildHasher as _;
 use hashbrown::DefaultHashBuilder;
 use hashbrown::hash_table::{Entry, HashTable};
 
-use crate::cached::Cached;
 use crate::id::{Digest, RecordId};
+use crate::record::Record;
 
 /// What a set knows of a record besides its content.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
@@ -62,14 +62,14 @@ pub enum Inserted {
     Replaced,
 }
 
-/// Records of one namespace and kind, of all levels, in order of arrival.
+/// Records of one namespace, of all kinds and levels, in order of arrival.
 ///
 /// - Invariant: every id stands once in the index; the log holds it once, and once more for each replacement.
 /// - Two sets that saw the same records, in any order and with repeats, hold the same id-to-bytes mapping.
 /// - Equal ids with different bytes come from different builds or machines; the smaller bytes win everywhere.
-#[derive(Clone, Debug)]
-pub struct RecordSet<C> {
-    log: Vec<(Tag, C)>,
+#[derive(Clone, Debug, Default)]
+pub struct RecordSet {
+    log: Vec<(Tag, Record)>,
     index: Index,
     /// What each step gathered.
     steps: BTreeMap<u32, Sum>,
@@ -98,13 +98,13 @@ impl Index {
         self.hasher.hash_one(id.0) as u32
     }
 
-    fn position<C: Cached>(&self, log: &[(Tag, C)], id: RecordId) -> Option<usize> {
+    fn position(&self, log: &[(Tag, Record)], id: RecordId) -> Option<usize> {
         let hash = self.hash(id);
         let slot = self.slots.find(spread(hash), |slot| slot.hash == hash && log[slot.at as usize].1.id() == id);
         slot.map(|slot| slot.at as usize)
     }
 
-    fn entry<C: Cached>(&mut self, log: &[(Tag, C)], id: RecordId) -> (Slot, Entry<'_, Slot>) {
+    fn entry(&mut self, log: &[(Tag, Record)], id: RecordId) -> (Slot, Entry<'_, Slot>) {
         let at = u32::try_from(log.len()).expect("no memory holds a log of 2^32 records");
         let hash = self.hash(id);
         let same = |slot: &Slot| slot.hash == hash && log[slot.at as usize].1.id() == id;
@@ -117,16 +117,10 @@ fn spread(hash: u32) -> u64 {
     u64::from(hash).wrapping_mul(0x9E37_79B9_7F4A_7C15)
 }
 
-impl<C> Default for RecordSet<C> {
-    fn default() -> Self {
-        let (log, index) = (Vec::new(), Index::default());
-        Self { log, index, steps: BTreeMap::new(), replaced: BTreeSet::new(), conflicts: 0 }
-    }
-}
-
-impl<C: Cached> RecordSet<C> {
+impl RecordSet {
     /// Unites with one record.
-    pub fn insert(&mut self, tag: Tag, record: C) -> Inserted {
+    pub fn insert(&mut self, tag: Tag, record: impl Into<Record>) -> Inserted {
+        let record = record.into();
         let id = record.id();
         let (new, slot) = self.index.entry(&self.log, id);
         let mut slot = match slot {
@@ -172,7 +166,7 @@ impl<C: Cached> RecordSet<C> {
     }
 
     /// The record of an id.
-    pub fn get(&self, id: RecordId) -> Option<&(Tag, C)> {
+    pub fn get(&self, id: RecordId) -> Option<&(Tag, Record)> {
         self.position_of(id).map(|at| &self.log[at])
     }
 
@@ -182,12 +176,12 @@ impl<C: Cached> RecordSet<C> {
     }
 
     /// The log from a position on, in order of arrival. Empty past the end.
-    pub fn since(&self, position: usize) -> &[(Tag, C)] {
+    pub fn since(&self, position: usize) -> &[(Tag, Record)] {
         &self.log[position.min(self.log.len())..]
     }
 
     /// The records of one level, in order of arrival, replaced ones left out.
-    pub fn level(&self, level: u32) -> impl Iterator<Item = &C> {
+    pub fn level(&self, level: u32) -> impl Iterator<Item = &Record> {
         let of_level = self.log.iter().enumerate().filter(move |(_, (tag, _))| tag.level == level);
         // Nearly always there is nothing to look up.
         let current = move |at, id| self.replaced.is_empty() || self.position_of(id) == Some(at);
@@ -222,7 +216,7 @@ impl<C: Cached> RecordSet<C> {
     /// The records before positions 0, 1, ... of the log.
     fn prefixes(&self) -> impl Iterator<Item = Sum> {
         let mut sum = Sum::default();
-        let next = move |(at, (_, record)): (usize, &(Tag, C))| {
+        let next = move |(at, (_, record)): (usize, &(Tag, Record))| {
             if !self.replaced.contains(&at) {
                 sum.add(record.id());
             }
@@ -242,33 +236,34 @@ impl<C: Cached> RecordSet<C> {
     }
 }
 
-fn bytes<C: Cached>(record: &C) -> Vec<u8> {
-    let mut bytes = Vec::with_capacity(C::BYTES);
+/// What decides between two contents of one id.
+fn bytes(record: &Record) -> (u32, Vec<u8>) {
+    let mut bytes = Vec::new();
     record.encode(&mut bytes);
-    bytes
+    (record.kind(), bytes)
 }
 
 #[cfg(test)]
 mod tests {
-    use glam::Vec3;
     use proptest::prelude::*;
 
     use super::*;
-    use crate::null::Null;
+    use crate::shrink::Shrink;
 
     const ONE: Tag = Tag { level: 1, step: 0 };
 
     /// Few ids and few contents, so that repeats and conflicts are common.
-    fn records() -> impl Strategy<Value = Vec<Null>> {
-        let one = (0u128..12, 0..3u8).prop_map(|(id, x)| Null {
-            id: RecordId(id),
-            position: Vec3::splat(f32::from(x)),
-            radius: 1.0,
-        });
+    fn records() -> impl Strategy<Value = Vec<Shrink>> {
+        let one = (0u128..12, 0..3u8).prop_map(|(id, a)| record(id, f32::from(a)));
         prop::collection::vec(one, 0..40)
     }
 
-    fn union(parts: &[&[Null]]) -> RecordSet<Null> {
+    /// The smallest record there is.
+    fn record(id: u128, a: f32) -> Shrink {
+        Shrink { id: RecordId(id), of: RecordId(0), a }
+    }
+
+    fn union(parts: &[&[Shrink]]) -> RecordSet {
         let mut set = RecordSet::default();
         for record in parts.iter().copied().flatten() {
             set.insert(ONE, *record);
@@ -276,9 +271,13 @@ mod tests {
         set
     }
 
+    fn shrink(record: &Record) -> Option<Shrink> {
+        if let Record::Shrink(shrink) = record { Some(*shrink) } else { None }
+    }
+
     /// What a set holds, whatever way it came there.
-    fn content(set: &RecordSet<Null>) -> (Digest, Vec<(u128, Vec<u8>)>) {
-        let mut all: Vec<_> = set.level(1).map(|r| (r.id.0, bytes(r))).collect();
+    fn content(set: &RecordSet) -> (Digest, Vec<(RecordId, (u32, Vec<u8>))>) {
+        let mut all: Vec<_> = set.level(1).map(|r| (r.id(), bytes(r))).collect();
         all.sort();
         (set.digest(), all)
     }
@@ -297,7 +296,7 @@ mod tests {
         #[test]
         fn merging_is_associative(a in records(), b in records(), c in records()) {
             let (ab, bc) = (union(&[&a, &b]), union(&[&b, &c]));
-            let held = |s: &RecordSet<Null>| s.level(1).copied().collect::<Vec<_>>();
+            let held = |s: &RecordSet| s.level(1).filter_map(shrink).collect::<Vec<_>>();
             prop_assert_eq!(content(&union(&[&held(&ab), &c])), content(&union(&[&a, &held(&bc)])));
         }
 
@@ -314,28 +313,28 @@ mod tests {
 
     #[test]
     fn smaller_bytes_win_and_the_conflict_is_counted() {
-        let at = |x: f32| Null { id: RecordId(1), position: Vec3::splat(x), radius: 1.0 };
+        let at = |a: f32| record(1, a);
         let mut set = union(&[&[at(1.0)]]);
         // Little endian: 2.0 begins 00 00 00, 1.0 begins 00 00 80.
         assert_eq!(set.insert(ONE, at(2.0)), Inserted::Replaced);
         assert_eq!(set.insert(ONE, at(1.0)), Inserted::Known);
-        assert_eq!(set.level(1).next().map(|r| r.position.x), Some(2.0));
+        assert_eq!(set.level(1).next().and_then(shrink).map(|r| r.a), Some(2.0));
         assert_eq!((set.len(), set.position(), set.conflicts()), (1, 2, 2));
         assert_eq!((set.prefix(0).records, set.prefix(1), set.prefix(2)), (0, set.sum(), set.sum()));
     }
 
     #[test]
     fn a_beginning_of_the_log_is_found_by_its_digest() {
-        let null = |id| Null { id: RecordId(id), position: Vec3::ZERO, radius: 1.0 };
-        let set = union(&[&[null(4), null(1), null(9)]]);
+        let any = |id| record(id, 1.0);
+        let set = union(&[&[any(4), any(1), any(9)]]);
         assert_eq!([0, 4, 5, 14, 9].map(|digest| set.find(Digest(digest))), [Some(0), Some(1), Some(2), Some(3), None]);
     }
 
     #[test]
     fn what_a_step_may_read_does_not_depend_on_arrival() {
-        let null = |id| Null { id: RecordId(id), position: Vec3::ZERO, radius: 1.0 };
+        let any = |id| record(id, 1.0);
         let at = |step| Tag { level: 1, step };
-        let mut entries = [(at(2), null(4)), (at(0), null(1)), (at(1), null(2)), (at(1), null(9))];
+        let mut entries = [(at(2), any(4)), (at(0), any(1)), (at(1), any(2)), (at(1), any(9))];
         for _ in 0..4 {
             entries.rotate_left(1);
             let mut set = RecordSet::default();
@@ -345,7 +344,7 @@ mod tests {
             let sums: Vec<_> = (0..4).map(|step| (set.before(step).records, set.before(step).digest.0)).collect();
             assert_eq!(sums, [(0, 0), (1, 1), (3, 12), (4, 16)]);
             // The same record from a lower step: it takes the place, and counts there.
-            assert_eq!(set.insert(at(0), null(4)), Inserted::Replaced);
+            assert_eq!(set.insert(at(0), any(4)), Inserted::Replaced);
             assert_eq!((set.before(1).digest.0, set.before(3).digest.0, set.sum().records), (5, 16, 4));
         }
     }

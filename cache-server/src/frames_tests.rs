@@ -53,7 +53,7 @@ fn gathers(step: &v1::Step, tile: u32) -> u64 {
 
 /// The steps a frame must go through, and what each gathers.
 fn model(levels: u32) -> Vec<(Step, u64)> {
-    let (mut plan, mut all, mut last) = (Plan::new(levels), Vec::new(), 0);
+    let (mut plan, mut all, mut last) = (Plan::new(levels, false), Vec::new(), 0);
     while let Some(step) = plan.next(last) {
         let wire = convert::step(all.len() as u32, &step, 0, Default::default());
         last = (0..TILES).map(|tile| gathers(&wire, tile)).sum();
@@ -226,6 +226,8 @@ proptest! {
         prop_assert_eq!(farm.tiles.len(), TILES as usize);
         prop_assert_eq!(done.leases_lost, farm.losses);
         prop_assert_eq!(done.rounds as usize, steps.len() - 1);
+        let begins = |(step, _): &&(Step, u64)| matches!(step, Step::Fill { level: 1, ranks, .. } if ranks.start == 0);
+        prop_assert_eq!(done.passes as usize, steps.iter().filter(begins).count());
         prop_assert_eq!(done.counts, vec![v1::Count { name: "rays".into(), value: (steps.len() as u32 * TILES).into() }]);
         let sealed: Vec<_> = farm.steps.values().map(|(step, ..)| step.sealed_position).collect();
         prop_assert!(sealed.is_sorted(), "each step reads what the one before left");

@@ -80,7 +80,7 @@ impl Queries {
             (position, replica.level(&key.namespace, key.level))
         };
         let mut sealed = Sealed::new(key.a);
-        sealed.extend(records);
+        sealed.unite(&records);
         let sealed = Arc::new(sealed);
         let mut kept = lock(&self.kept);
         kept.retain(|k| k.key != key);

@@ -9,7 +9,7 @@ use std::ops::Range;
 
 use cache_core::id::Digest;
 use cache_core::set::{Inserted, Sum};
-use cache_core::{Irradiance, Namespace, RecordSet, Tag};
+use cache_core::{Namespace, Record, RecordSet, Tag};
 use cache_proto::convert::{self, BATCH_RECORDS_MAX, Checked};
 use cache_proto::v1;
 use prost::Message as _;
@@ -41,7 +41,7 @@ pub struct Mark {
 /// One namespace.
 #[derive(Debug, Default)]
 struct Kept {
-    set: RecordSet<Irradiance>,
+    set: RecordSet,
     label: Option<v1::Label>,
     draft_of: Option<Namespace>,
     /// Frames that fill this draft now.
@@ -78,7 +78,7 @@ impl Replica {
     ///
     /// # Errors
     /// [`Refusal::Full`]; nothing of the entry is used then.
-    pub fn apply(&mut self, entry: Checked<Irradiance>) -> Result<Added, Refusal> {
+    pub fn apply(&mut self, entry: Checked) -> Result<Added, Refusal> {
         match entry {
             Checked::Batch(namespace, tag, records) => self.insert(namespace, tag, &records),
             Checked::Label(namespace, draft_of, label) => {
@@ -121,7 +121,7 @@ impl Replica {
     }
 
     /// Unites with a batch. What is published already goes where it was published to, too.
-    fn insert(&mut self, namespace: Namespace, tag: Tag, records: &[Irradiance]) -> Result<Added, Refusal> {
+    fn insert(&mut self, namespace: Namespace, tag: Tag, records: &[Record]) -> Result<Added, Refusal> {
         if records.is_empty() {
             return Ok(Added { added: 0, position: self.mark(&namespace).position });
         }
@@ -138,12 +138,15 @@ impl Replica {
     }
 
     /// Unites with records there is room for.
-    fn unite(&mut self, namespace: Namespace, tag: Tag, records: &[Irradiance]) -> Added {
+    fn unite(&mut self, namespace: Namespace, tag: Tag, records: &[Record]) -> Added {
         let set = &mut self.kept.entry(namespace).or_default().set;
         let (before, known) = (set.position(), set.len());
         for record in records {
             if set.insert(tag, *record) == Inserted::Replaced {
-                tracing::warn!(id = format_args!("{:032x}", record.id.0), "a record came twice with different content");
+                tracing::warn!(
+                    id = format_args!("{:032x}", { record.id().0 }),
+                    "a record came twice with different content"
+                );
             }
         }
         self.held += set.position() - before;
@@ -218,24 +221,25 @@ impl Replica {
         }
     }
 
-    /// What stands at a position of the log: records of one tag, as many as fit one batch, and how many those are.
+    /// What stands at a position of the log: records of one tag and kind, as many as fit one batch, and how many those are.
     /// `None` at the end.
     ///
     /// # Errors
     /// [`Refusal::PastEnd`], [`Refusal::Published`].
     pub fn read(&self, namespace: &Namespace, position: u64) -> Result<Option<(u64, v1::RecordBatch)>, Refusal> {
         let rest = self.since(namespace, position)?;
-        let Some(&(tag, _)) = rest.first() else { return Ok(None) };
-        let count = rest.iter().take(BATCH_RECORDS_MAX).take_while(|(t, _)| *t == tag).count();
+        let Some((tag, first)) = rest.first() else { return Ok(None) };
+        let alike = |(t, record): &&(Tag, Record)| t == tag && record.kind() == first.kind();
+        let count = rest.iter().take(BATCH_RECORDS_MAX).take_while(alike).count();
         let run = rest[..count].iter().map(|(_, record)| record);
-        Ok(Some((count as u64, convert::pack(namespace, tag, run))))
+        Ok(Some((count as u64, convert::pack(namespace, *tag, run))))
     }
 
     /// The log of a namespace from a position on, in order of arrival.
     ///
     /// # Errors
     /// [`Refusal::PastEnd`], or [`Refusal::Published`] for a draft that is no more.
-    pub fn since(&self, namespace: &Namespace, position: u64) -> Result<&[(Tag, Irradiance)], Refusal> {
+    pub fn since(&self, namespace: &Namespace, position: u64) -> Result<&[(Tag, Record)], Refusal> {
         let Some(kept) = self.kept.get(namespace) else {
             return match position {
                 _ if self.published.contains_key(namespace) => Err(Refusal::Published),
@@ -252,13 +256,13 @@ impl Replica {
 
     /// Where a namespace's log stands now.
     pub fn mark(&self, namespace: &Namespace) -> Mark {
-        let mark = |set: &RecordSet<_>| Mark { position: set.position() as u64, sum: set.sum() };
+        let mark = |set: &RecordSet| Mark { position: set.position() as u64, sum: set.sum() };
         self.set(namespace).map(mark).unwrap_or_default()
     }
 
     /// Where a draft's log stands now, and what the steps before `step` gathered.
     pub fn mark_before(&self, draft: &Namespace, step: u32) -> Mark {
-        let mark = |set: &RecordSet<_>| Mark { position: set.position() as u64, sum: set.before(step) };
+        let mark = |set: &RecordSet| Mark { position: set.position() as u64, sum: set.before(step) };
         self.set(draft).map(mark).unwrap_or_default()
     }
 
@@ -274,19 +278,19 @@ impl Replica {
 
     /// Where a subscription begins that holds `position` records of `digest`: there, or at 0 if this log has others.
     pub fn resume(&self, namespace: &Namespace, position: u64, digest: Digest) -> u64 {
-        let same = |set: &RecordSet<_>| {
+        let same = |set: &RecordSet| {
             usize::try_from(position).is_ok_and(|at| at <= set.position() && set.prefix(at).digest == digest)
         };
         if self.set(namespace).is_some_and(same) { position } else { 0 }
     }
 
     /// The records of one level, replaced ones left out.
-    pub fn level(&self, namespace: &Namespace, level: u32) -> Vec<Irradiance> {
+    pub fn level(&self, namespace: &Namespace, level: u32) -> Vec<Record> {
         self.set(namespace).map_or(Vec::new(), |set| set.level(level).copied().collect())
     }
 
     /// The records of a namespace.
-    pub fn set(&self, namespace: &Namespace) -> Option<&RecordSet<Irradiance>> {
+    pub fn set(&self, namespace: &Namespace) -> Option<&RecordSet> {
         self.kept.get(namespace).map(|kept| &kept.set)
     }
 
@@ -348,7 +352,7 @@ impl Replica {
 
 #[cfg(test)]
 mod tests {
-    use cache_core::RecordId;
+    use cache_core::{Irradiance, RecordId, Shrink};
     use glam::{Vec2, Vec3};
     use proptest::prelude::*;
 
@@ -356,8 +360,12 @@ mod tests {
 
     const NAMESPACE: Namespace = Namespace([7; 32]);
 
-    fn record(id: u32, x: f32) -> Irradiance {
-        Irradiance {
+    /// Every third is a proposal.
+    fn record(id: u32, x: f32) -> Record {
+        if id % 3 == 2 {
+            return Shrink::new(RecordId(id.into()), 0.1).into();
+        }
+        let record = Irradiance {
             id: RecordId(id.into()),
             position: Vec3::X * x,
             normal: Vec3::Z,
@@ -369,7 +377,8 @@ mod tests {
             gradient_r: [Vec2::ZERO; 3],
             ellipse: [0.0; 3],
             noise: 0.0,
-        }
+        };
+        record.into()
     }
 
     /// Reads batches from a position to the end into another replica.
@@ -409,18 +418,20 @@ mod tests {
     }
 
     #[test]
-    fn batches_hold_one_level_and_at_most_4096_records() {
+    fn batches_hold_one_level_and_kind_and_at_most_4096_records() {
         let mut replica = Replica::new(Limits::default());
-        let records: Vec<_> = (0..5000).map(|id| record(id, 0.0)).collect();
+        let records: Vec<_> = (0..5000).map(|id| record(3 * id, 0.0)).collect();
         replica.insert(NAMESPACE, Tag::level(1), &records).expect("room");
-        replica.insert(NAMESPACE, Tag::level(2), &[record(5000, 0.0)]).expect("room");
-        let count = |position| replica.read(&NAMESPACE, position).map(|read| read.map(|(count, b)| (count, b.level)));
-        assert_eq!(count(0).expect("there"), Some((4096, 1)));
-        assert_eq!(count(4096).expect("there"), Some((904, 1)));
-        assert_eq!(count(5000).expect("there"), Some((1, 2)));
-        assert_eq!(count(5001).expect("the end"), None);
-        let error = count(5002).expect_err("past the end").to_string();
-        assert!(error.contains("5002") && error.contains("5001"), "{error}");
+        replica.insert(NAMESPACE, Tag::level(2), &[record(15000, 0.0), record(15002, 0.0)]).expect("room");
+        let read = |position| replica.read(&NAMESPACE, position);
+        let count = |position| read(position).map(|read| read.map(|(count, b)| (count, b.level, b.kind)));
+        assert_eq!(count(0).expect("there"), Some((4096, 1, 1)));
+        assert_eq!(count(4096).expect("there"), Some((904, 1, 1)));
+        assert_eq!(count(5000).expect("there"), Some((1, 2, 1)));
+        assert_eq!(count(5001).expect("there"), Some((1, 2, 2)));
+        assert_eq!(count(5002).expect("the end"), None);
+        let error = count(5003).expect_err("past the end").to_string();
+        assert!(error.contains("5003") && error.contains("5002"), "{error}");
     }
 
     #[test]
@@ -437,12 +448,12 @@ mod tests {
 
     const DRAFT: Namespace = Namespace([9; 32]);
 
-    fn label(namespace: Namespace, draft_of: Option<Namespace>, owner: &str) -> Checked<Irradiance> {
+    fn label(namespace: Namespace, draft_of: Option<Namespace>, owner: &str) -> Checked {
         let label = v1::Label { owner: owner.into(), ..Default::default() };
         Checked::Label(namespace, draft_of, label)
     }
 
-    fn gathered(step: u32, ids: Range<u32>) -> Checked<Irradiance> {
+    fn gathered(step: u32, ids: Range<u32>) -> Checked {
         Checked::Batch(DRAFT, Tag { level: 1, step }, ids.map(|id| record(id, 0.0)).collect())
     }
 
@@ -463,7 +474,9 @@ mod tests {
                 replica.apply(entries[at].clone()).expect("room");
             }
             prop_assert_eq!(replica.mark(&NAMESPACE).sum.records, 7);
-            prop_assert_eq!(replica.mark(&NAMESPACE).sum.digest, Digest((0..7).sum()));
+            let mut digest = Digest::default();
+            (0..7).for_each(|id| digest.add(record(id, 0.0).id()));
+            prop_assert_eq!(replica.mark(&NAMESPACE).sum.digest, digest);
             prop_assert_eq!(replica.label_of(&NAMESPACE).map(|l| l.owner.as_str()), Some("a"));
             prop_assert_eq!(replica.info("a").len(), 1);
             prop_assert!(replica.since(&DRAFT, 0).is_err());

@@ -141,6 +141,7 @@ pub(crate) mod tests {
             bounces: 1,
             seed: 0,
             levels,
+            adaptive: false,
             effort: None,
         }
     }

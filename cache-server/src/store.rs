@@ -9,7 +9,7 @@ use std::io;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
 
-use cache_core::{Irradiance, Namespace};
+use cache_core::Namespace;
 use cache_proto::convert::{self, Checked};
 use cache_proto::v1::entry::Entry as Kind;
 use cache_proto::v1::{Entry, Label, Publication, RecordBatch};
@@ -48,7 +48,7 @@ struct Shared {
 /// An entry on its way, and whom to tell.
 struct Pending {
     entry: Entry,
-    checked: Checked<Irradiance>,
+    checked: Checked,
     /// Whose batch or label it is; publications are the server's own.
     tenant: Option<String>,
     kept: oneshot::Sender<Result<Added, Refusal>>,
@@ -138,12 +138,7 @@ impl Store {
         self.queue(entry, checked, tenant).await?.kept().await
     }
 
-    async fn queue(
-        &self,
-        entry: Entry,
-        checked: Checked<Irradiance>,
-        tenant: Option<String>,
-    ) -> Result<Keeping, Refusal> {
+    async fn queue(&self, entry: Entry, checked: Checked, tenant: Option<String>) -> Result<Keeping, Refusal> {
         let (kept, keeping) = oneshot::channel();
         let pending = Pending { entry, checked, tenant, kept };
         self.queue.send(pending).await.map_err(|_| Refusal::Closing)?;
@@ -354,7 +349,7 @@ pub(crate) fn lock<T: ?Sized>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 #[cfg(test)]
 mod tests {
-    use cache_core::{RecordId, Tag};
+    use cache_core::{Irradiance, RecordId, Tag};
     use glam::{Vec2, Vec3};
 
     use super::*;

@@ -8,7 +8,7 @@ use std::io::{BufRead as _, BufReader, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use cache_core::{Irradiance, Namespace, RecordId};
+use cache_core::{Namespace, RecordId};
 use cache_proto::convert;
 use cache_proto::v1::cache_client::CacheClient;
 use support::{insert, record, soon, subscribe};
@@ -108,9 +108,9 @@ impl Server {
         let (mut held, mut read) = (BTreeSet::new(), 0);
         while read < end {
             let batch = soon(stream.message()).await.expect("no error").expect("more").batch.expect("records");
-            let (_, _, records) = convert::unpack::<Irradiance>(&batch).expect("sound");
+            let (_, _, records) = convert::unpack(&batch).expect("sound");
             read += records.len() as u64;
-            held.extend(records.iter().map(|record| record.id));
+            held.extend(records.iter().map(|record| record.id()));
         }
         held
     }

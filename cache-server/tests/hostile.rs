@@ -95,7 +95,7 @@ impl Neighbour {
         let mut read = 0;
         while read < self.sent as usize {
             let batch = soon(stream.message()).await.expect("no error").expect("no end").batch;
-            read += batch.map_or(0, |batch| convert::unpack::<Irradiance>(&batch).expect("sound").2.len());
+            read += batch.map_or(0, |batch| convert::unpack(&batch).expect("sound").2.len());
         }
     }
 }

@@ -3,7 +3,7 @@
 use std::convert::Infallible;
 use std::time::Duration;
 
-use cache_core::{Irradiance, Namespace, Query, RecordId, Sealed, Tag};
+use cache_core::{Irradiance, Namespace, Query, Record, RecordId, Sealed, Shrink, Tag};
 use cache_proto::v1::cache_client::CacheClient;
 use cache_proto::v1::frame_event::Event;
 use cache_proto::v1::frames_client::FramesClient;
@@ -121,13 +121,13 @@ async fn subscribed(
 }
 
 /// Reads a subscription until `count` records have come; returns them with their levels.
-async fn read(stream: &mut tonic::Streaming<v1::SubscribeResponse>, from: u64, count: usize) -> Vec<(Tag, Irradiance)> {
+async fn read(stream: &mut tonic::Streaming<v1::SubscribeResponse>, from: u64, count: usize) -> Vec<(Tag, Record)> {
     let mut all = Vec::new();
     while all.len() < count {
         let response = soon(stream.message()).await.expect("no error").expect("no end");
         assert_eq!(response.position, from + all.len() as u64);
         let batch = response.batch.expect("a batch");
-        let (namespace, level, records) = convert::unpack::<Irradiance>(&batch).expect("sound");
+        let (namespace, level, records) = convert::unpack(&batch).expect("sound");
         assert_eq!(namespace, NAMESPACE);
         all.extend(records.into_iter().map(|record| (level, record)));
     }
@@ -149,7 +149,8 @@ async fn what_is_inserted_is_streamed_counted_and_digested() {
         let again = insert(&mut cache, batches).await.expect("harmless");
         assert_eq!((again.added, again.position), (0, 5000));
 
-        let expected: Vec<_> = (0..5000).map(|id| (Tag::level(if id < 4096 { 1 } else { 2 }), record(id))).collect();
+        let expected: Vec<_> =
+            (0..5000).map(|id| (Tag::level(if id < 4096 { 1 } else { 2 }), record(id).into())).collect();
         assert_eq!(read(&mut early, 0, 5000).await, expected);
         let mut late = subscribed(&mut cache, subscribe(4990), 4990).await;
         assert_eq!(read(&mut late, 4990, 10).await, expected[4990..]);
@@ -226,7 +227,7 @@ async fn many_subscribers_hear_everything() {
     for _ in 0..128 {
         streams.push(subscribed(&mut cache, subscribe(0), 0).await);
     }
-    let all = records(0..100);
+    let all: Vec<Record> = records(0..100).into_iter().map(Record::from).collect();
     for record in &all {
         insert(&mut cache, vec![convert::pack(&NAMESPACE, Tag::level(1), [record])]).await.expect("kept");
     }
@@ -249,8 +250,13 @@ async fn query_answers_what_a_replica_would_bit_for_bit() {
         let mut added = records(from..to);
         added.reverse();
         insert(&mut cache, vec![convert::pack(&NAMESPACE, Tag::level(2), &added)]).await.expect("sound");
+        let shrinks = |ids: std::ops::Range<u32>| ids.map(|id| Shrink::new(record(id).id, 0.1)).collect::<Vec<_>>();
+        insert(&mut cache, vec![convert::pack(&NAMESPACE, Tag::level(2), &shrinks(from..from + 50))])
+            .await
+            .expect("sound");
         let mut local = Sealed::new(0.3);
         local.extend(records(0..to));
+        local.shrink([shrinks(0..50), if from > 0 { shrinks(150..200) } else { Vec::new() }].concat());
         let expected: Vec<u8> = queries
             .iter()
             .flat_map(|query| {
@@ -319,6 +325,7 @@ fn spec() -> v1::FrameSpec {
         bounces: 0,
         seed: 0,
         levels: 1,
+        adaptive: false,
         effort: None,
     }
 }

@@ -73,6 +73,7 @@ pub fn spec() -> v1::FrameSpec {
         bounces: 1,
         seed: 0,
         levels: 1,
+        adaptive: false,
         effort: None,
     }
 }
@@ -189,13 +190,14 @@ fn rendered(spec: &v1::FrameSpec) {
     let frame = worker::frame::Frame::new(room(), Settings { width: few, height: few, ..settings });
     let mut levels: Vec<_> = (0..frame.levels()).map(|_| Arc::new(Sealed::new(frame.settings().a))).collect();
     for level in (1..=frame.levels()).rev() {
-        let (records, _) = frame.fill(level, 0, 0..64, 0, &levels, &|_| None);
-        for record in &records {
-            assert_eq!(record.check(), Ok(()));
+        // The fifth pass refines.
+        for pass in [0, 4] {
+            let (records, _) = frame.fill(level, pass, 0..64, 0, &levels, &|_| None);
+            for record in &records {
+                assert_eq!(record.check(), Ok(()));
+            }
+            Arc::make_mut(&mut levels[level as usize - 1]).unite(&records);
         }
-        let mut sealed = Sealed::new(frame.settings().a);
-        sealed.extend(records);
-        levels[level as usize - 1] = Arc::new(sealed);
     }
     drop(frame.pixels(0, &levels));
 }

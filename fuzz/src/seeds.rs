@@ -1,6 +1,6 @@
 //! Where the fuzzer begins: small inputs that reach far, made here so that no binary files need to be kept.
 
-use cache_core::{Cached as _, Irradiance, Namespace, RecordId, Tag};
+use cache_core::{Irradiance, Namespace, Packed as _, RecordId, Shrink, Tag};
 use cache_proto::convert;
 use cache_proto::v1::{self, entry::Entry as Kind};
 use cache_server::journal::value::Place;
@@ -50,6 +50,7 @@ fn record() -> Vec<Vec<u8>> {
     vec![
         many(1, |_, _| ()),
         many(5, |_, _| ()),
+        many(5, |r, n| r.noise = f32::from_bits(0x3f80_0000 | u32::from(n))),
         many(4, |r, n| (r.radius, r.radius_min) = (1e-30 * f32::from(n + 1), 1e-38)),
         many(4, |r, n| (r.radius, r.position) = (1e-30, Vec3::splat(1e-22 * f32::from(n)))),
         many(4, |r, n| (r.radius, r.radius_max, r.position.x) = (3e-9, 0.1, f32::from(n))),
@@ -73,6 +74,7 @@ fn entries() -> Vec<v1::Entry> {
         Kind::Publication(publication),
         Kind::Batch(batch(1, 4)),
         Kind::Batch(batch(2, 0)),
+        Kind::Batch(convert::pack(&namespace(1), Tag { level: 1, step: 5 }, &[Shrink::new(sample(1).id, 0.1)])),
     ];
     kinds.into_iter().map(|kind| v1::Entry { entry: Some(kind) }).collect()
 }

@@ -2,7 +2,7 @@
 
 use cache_core::id::Digest;
 use cache_core::set::Tag;
-use cache_core::{Cached, Invalid, Namespace, rounds};
+use cache_core::{Invalid, Irradiance, Namespace, Packed as _, Record, rounds};
 
 use crate::v1;
 
@@ -26,13 +26,8 @@ pub enum Malformed {
     #[error("{0} is missing")]
     Missing(&'static str),
     /// Records of a kind this build does not know.
-    #[error("records of kind {got}, expected kind {expected}")]
-    Kind {
-        /// What there was.
-        got: u32,
-        /// What would have been right.
-        expected: u32,
-    },
+    #[error("records of kind {0}: made by a newer build?")]
+    Kind(u32),
     /// A level no record can have.
     #[error("level is {0}, expected 1 to 64")]
     Level(u32),
@@ -89,20 +84,22 @@ pub fn digest_bytes(digest: Digest) -> prost::bytes::Bytes {
     prost::bytes::Bytes::copy_from_slice(&digest.0.to_le_bytes())
 }
 
-/// Packs records of one tag. At most [`BATCH_RECORDS_MAX`] of them make a batch a server accepts.
-pub fn pack<'a, C: Cached>(
+/// Packs records of one tag and kind. At most [`BATCH_RECORDS_MAX`] of them make a batch a server accepts.
+pub fn pack<'a, R: Into<Record> + Copy + 'a>(
     namespace: &Namespace,
     tag: Tag,
-    records: impl IntoIterator<Item = &'a C>,
+    records: impl IntoIterator<Item = &'a R>,
 ) -> v1::RecordBatch {
-    let records = records.into_iter();
-    let mut bytes = Vec::with_capacity(records.size_hint().0 * C::BYTES);
+    let mut records = records.into_iter().map(|record| -> Record { (*record).into() }).peekable();
+    let kind = records.peek().map_or(Irradiance::KIND, Record::kind);
+    let mut bytes = Vec::with_capacity(records.size_hint().0 * Record::bytes(kind).unwrap_or(0));
     for record in records {
+        debug_assert_eq!(record.kind(), kind);
         record.encode(&mut bytes);
     }
     v1::RecordBatch {
         namespace: prost::bytes::Bytes::copy_from_slice(&namespace.0),
-        kind: C::KIND,
+        kind,
         level: tag.level,
         records: bytes.into(),
         step: tag.step,
@@ -113,30 +110,29 @@ pub fn pack<'a, C: Cached>(
 ///
 /// # Errors
 /// The first thing that is not sound. Nothing of an unsound batch is used.
-pub fn unpack<C: Cached>(batch: &v1::RecordBatch) -> Result<(Namespace, Tag, Vec<C>), Malformed> {
+pub fn unpack(batch: &v1::RecordBatch) -> Result<(Namespace, Tag, Vec<Record>), Malformed> {
     let namespace = namespace(&batch.namespace)?;
-    if batch.kind != C::KIND {
-        return Err(Malformed::Kind { got: batch.kind, expected: C::KIND });
-    }
+    let size = Record::bytes(batch.kind).ok_or(Malformed::Kind(batch.kind))?;
     if !(1..=64).contains(&batch.level) {
         return Err(Malformed::Level(batch.level));
     }
-    if batch.records.len() > BATCH_RECORDS_MAX * C::BYTES {
+    if batch.records.len() > BATCH_RECORDS_MAX * size {
         return Err(Malformed::TooMany(batch.records.len()));
     }
     // Collecting results would not know how many come.
-    let mut records = Vec::with_capacity(batch.records.len().div_ceil(C::BYTES));
-    for (index, bytes) in batch.records.chunks(C::BYTES).enumerate() {
-        records.push(C::decode(bytes).map_err(|reason| Malformed::Record { index, reason })?);
+    let mut records = Vec::with_capacity(batch.records.len().div_ceil(size));
+    for (index, bytes) in batch.records.chunks(size).enumerate() {
+        let record = Record::decode(batch.kind, bytes).ok_or(Malformed::Kind(batch.kind))?;
+        records.push(record.map_err(|reason| Malformed::Record { index, reason })?);
     }
     Ok((namespace, Tag { level: batch.level, step: batch.step }, records))
 }
 
 /// An entry of a store whose parts are sound.
 #[derive(Clone, PartialEq, Debug)]
-pub enum Checked<C> {
+pub enum Checked {
     /// Records of a namespace.
-    Batch(Namespace, Tag, Vec<C>),
+    Batch(Namespace, Tag, Vec<Record>),
     /// What a namespace is; second, for a draft, whose.
     Label(Namespace, Option<Namespace>, v1::Label),
     /// A draft belongs to a namespace from now on.
@@ -152,7 +148,7 @@ pub enum Checked<C> {
 ///
 /// # Errors
 /// The first thing that is not sound. Nothing of an unsound entry is used.
-pub fn entry<C: Cached>(entry: &v1::Entry) -> Result<Checked<C>, Malformed> {
+pub fn entry(entry: &v1::Entry) -> Result<Checked, Malformed> {
     match &entry.entry {
         Some(v1::entry::Entry::Batch(batch)) => {
             let (namespace, tag, records) = unpack(batch)?;
@@ -207,7 +203,7 @@ pub fn plan_step(step: &v1::Step) -> rounds::Step {
 
 #[cfg(test)]
 mod tests {
-    use cache_core::Irradiance;
+    use cache_core::{RecordId, Shrink};
     use proptest::prelude::*;
 
     use super::*;
@@ -216,10 +212,11 @@ mod tests {
         #[test]
         fn random_bytes_never_panic_and_never_pass_unsound(bytes in prop::collection::vec(any::<u8>(), 0..600), kind in 0u32..3, level in 0u32..70) {
             let batch = v1::RecordBatch { namespace: vec![0; 32].into(), kind, level, records: bytes.into(), step: 0 };
-            if let Ok((_, _, records)) = unpack::<Irradiance>(&batch) {
-                for record in records {
+            if let Ok((namespace, tag, records)) = unpack(&batch) {
+                for record in &records {
                     prop_assert!(record.check().is_ok());
                 }
+                prop_assert!(records.is_empty() || pack(&namespace, tag, &records) == batch);
             }
         }
     }
@@ -233,12 +230,23 @@ mod tests {
             records: records.into(),
             step: 0,
         };
-        let message = |b: &v1::RecordBatch| unpack::<Irradiance>(b).expect_err("unsound").to_string();
+        let message = |b: &v1::RecordBatch| unpack(b).expect_err("unsound").to_string();
         assert!(message(&batch(vec![0; 129])).starts_with("record 0 of the batch: normal"));
         assert!(message(&batch(vec![0; 4097 * 128])).contains("at most 4096"));
+        assert!(message(&v1::RecordBatch { kind: 3, ..batch(vec![]) }).contains("kind 3: made by a newer build?"));
+        assert!(message(&v1::RecordBatch { kind: 2, ..batch(vec![0; 4097 * 36]) }).contains("at most 4096"));
         assert!(message(&v1::RecordBatch { level: 65, ..batch(vec![]) }).contains("level is 65"));
         assert!(
             message(&v1::RecordBatch { namespace: vec![1].into(), ..batch(vec![]) }).contains("namespace has 1 bytes")
         );
+    }
+
+    #[test]
+    fn batches_of_every_kind_come_back() {
+        let shrinks = [Shrink::new(RecordId(1), 0.1), Shrink::new(RecordId(2), 0.2)];
+        let batch = pack(&Namespace([3; 32]), Tag { level: 1, step: 9 }, &shrinks);
+        assert_eq!((batch.kind, batch.records.len()), (2, 72));
+        let (_, tag, records) = unpack(&batch).expect("sound");
+        assert_eq!((tag.step, records), (9, shrinks.map(Record::from).to_vec()));
     }
 }

@@ -4,7 +4,7 @@ use std::io;
 use std::sync::{Arc, Mutex, MutexGuard};
 
 use cache_core::id::{Digest, Random};
-use cache_core::{Irradiance, Namespace, Tag};
+use cache_core::{Namespace, Record, Tag};
 use cache_proto::v1::Entry;
 use cache_server::Limits;
 use cache_server::journal::Journal;
@@ -63,7 +63,7 @@ impl Disk {
     }
 
     /// The beginning of a namespace's log whose records have this digest.
-    pub fn prefix(&self, namespace: &Namespace, digest: Digest) -> Option<Vec<(Tag, Irradiance)>> {
+    pub fn prefix(&self, namespace: &Namespace, digest: Digest) -> Option<Vec<(Tag, Record)>> {
         let replica = self.replica();
         let end = replica.find(namespace, digest)?.position as usize;
         let log = replica.since(namespace, 0).ok()?;

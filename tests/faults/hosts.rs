@@ -143,7 +143,7 @@ pub async fn sharer(farm: Rc<Farm>) -> turmoil::Result {
             (0..count).map(|k| RecordId(u128::from(incarnation) << 96 | u128::from(number) << 32 | u128::from(k)));
         let ids: Vec<_> = ids.collect();
         farm.sent.borrow_mut().extend(&ids);
-        let records: Vec<_> = ids.iter().map(|id| (Tag::level(1), record(*id, Vec3::X))).collect();
+        let records: Vec<_> = ids.iter().map(|id| (Tag::level(1), record(*id, Vec3::X).into())).collect();
         let inserted = client::retry_for(Duration::MAX, || {
             let (mut cache, records) = (cache.clone(), &records);
             async move { follow::insert(&mut cache, &SHARED, records).await.map(tonic::Response::new) }

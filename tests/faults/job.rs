@@ -1,12 +1,13 @@
 //! A job that makes records up. They have the real size and go through the real caches; each depends on all that was
 //! sealed when it was made, so that whoever reads one record too many, or too few, makes others from then on.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
 use cache_core::id::{Digest, Origin, Random};
-use cache_core::rounds::{Plan, Step};
-use cache_core::{Cached as _, Irradiance, Namespace, Query, RecordId, Sealed, Tag};
+use cache_core::rounds::{Plan, Step, refines};
+use cache_core::{Irradiance, Namespace, Query, Record, RecordId, Sealed, Shrink, Tag};
 use cache_proto::{convert, v1};
 use glam::{Vec2, Vec3};
 use worker::frame::Levels;
@@ -59,6 +60,7 @@ pub fn view(number: u32, tiles: u32, levels: u32) -> v1::FrameSpec {
         bounces: levels,
         seed: 0,
         levels,
+        adaptive: number % 2 == 1,
         effort: None,
     }
 }
@@ -113,8 +115,21 @@ impl MadeUp {
         (0..count).map(|k| Vec3::new(rank as f32 + 0.25 * k as f32, tile as f32, place)).collect()
     }
 
+    /// What a tile proposes in a round that refines: of what is sealed at its sites, by all that is.
+    fn proposals(&self, step: &Step, tile: u32, levels: &Levels) -> Vec<Record> {
+        let Step::Fill { level, pass, ranks } = step else { return Vec::new() };
+        if !self.spec.adaptive || !refines(*level, *pass) || *pass >= 8 {
+            return Vec::new();
+        }
+        let sites = (0..4).flat_map(|pass| self.sites(*level, pass, ranks.start, tile));
+        let at = |position| levels[*level as usize - 1].contributions(&Query { position, normal: Vec3::Z });
+        let a = A * (0.5 + 0.4 * Random::named("a", &[digest(levels).0 as u64, tile.into()]).uniform());
+        let shrinks: BTreeSet<_> = sites.flat_map(at).map(|near| near.record.id).collect();
+        shrinks.into_iter().map(|of| Shrink::new(of, a).into()).collect()
+    }
+
     /// What a tile gathers in a round, found or made, and how many were found.
-    fn fill(&self, step: &Step, tile: u32, levels: &Levels, known: &Known) -> (Vec<Irradiance>, u64) {
+    fn fill(&self, step: &Step, tile: u32, levels: &Levels, known: &Known) -> (Vec<Record>, u64) {
         let Step::Fill { level, pass, ranks } = step else { return Default::default() };
         let (sealed, read) = (&levels[*level as usize - 1], digest(levels));
         let (mut records, mut found) = (Vec::new(), 0);
@@ -126,7 +141,7 @@ impl MadeUp {
             let origin = Origin { namespace: &self.namespace, kind: 1, level: *level, site: &site, seed: 0, read };
             let id = origin.id();
             found += u64::from(known(id).is_some());
-            records.push(known(id).unwrap_or_else(|| record(id, position)));
+            records.push(known(id).unwrap_or_else(|| record(id, position).into()));
         }
         (records, found)
     }
@@ -164,11 +179,12 @@ impl Job for MadeUp {
             if let Step::Fill { level, .. } = step {
                 let (records, found) = self.fill(&step, tile, &work.levels, &work.known);
                 let anew = records.len() as u64 - found;
-                let wait: u128 = records.iter().take(anew as usize).map(|r| r.id.0 % GATHER_MAX).sum();
+                let wait: u128 = records.iter().take(anew as usize).map(|r| r.id().0 % GATHER_MAX).sum();
                 tokio::time::sleep(Duration::from_millis(wait as u64)).await;
+                let proposals = self.proposals(&step, tile, &work.levels);
                 let tag = Tag { level, step: work.step.index };
                 done.counts.reused += found;
-                done.records.extend(records.into_iter().map(|record| (tag, record)));
+                done.records.extend(records.into_iter().chain(proposals).map(|record| (tag, record)));
             } else {
                 let pixels = self.pixels(tile, &work.levels).into();
                 done.tiles.push(v1::FrameTile { tile, pixels });
@@ -192,20 +208,23 @@ pub struct Reference {
 }
 
 /// Renders a frame from a base, with nobody in between.
-pub fn reference(spec: &v1::FrameSpec, base: &[(Tag, Irradiance)]) -> Reference {
+pub fn reference(spec: &v1::FrameSpec, base: &[(Tag, Record)]) -> Reference {
     let frame = MadeUp::new(spec.clone()).expect("our own");
     let mut levels: Levels = (0..spec.levels).map(|_| Arc::new(Sealed::new(spec.a))).collect();
     for (tag, record) in base {
-        Arc::make_mut(&mut levels[tag.level as usize - 1]).extend([*record]);
+        Arc::make_mut(&mut levels[tag.level as usize - 1]).unite([record]);
     }
     let nothing: Known = Arc::new(|_| None);
-    let (mut plan, mut gathered, mut last) = (Plan::new(spec.levels), Vec::new(), 0);
+    let (mut plan, mut gathered, mut last) = (Plan::new(spec.levels, spec.adaptive), Vec::new(), 0);
     while let Some(step @ Step::Fill { level, .. }) = plan.next(last) {
         let tiles = 0..frame.tiles();
-        let new: Vec<_> = tiles.flat_map(|tile| frame.fill(&step, tile, &levels, &nothing).0).collect();
+        let one = |tile| [frame.fill(&step, tile, &levels, &nothing).0, frame.proposals(&step, tile, &levels)].concat();
+        let new: Vec<_> = tiles.flat_map(one).collect();
         last = new.len() as u64;
-        gathered.extend(new.iter().map(|record| record.id()));
-        Arc::make_mut(&mut levels[level as usize - 1]).extend(new);
+        // Two tiles may propose the same.
+        let new: BTreeMap<_, _> = new.into_iter().map(|record| (record.id(), record)).collect();
+        gathered.extend(new.keys());
+        Arc::make_mut(&mut levels[level as usize - 1]).unite(new.values());
     }
     Reference { tiles: (0..frame.tiles()).map(|tile| frame.pixels(tile, &levels)).collect(), gathered }
 }

@@ -4,7 +4,7 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use cache_core::id::Digest;
-use cache_core::{Irradiance, RecordId, Tag};
+use cache_core::{Record, RecordId, Tag};
 use cache_proto::v1::frame_event::Event;
 use cache_proto::{VERSION, convert, v1};
 use tonic::Status;
@@ -52,7 +52,7 @@ struct Base {
     /// How often the disk had been lost when its frame was opened.
     losses: u32,
     /// `None`: it could not be found out.
-    records: Option<Vec<(Tag, Irradiance)>>,
+    records: Option<Vec<(Tag, Record)>>,
 }
 
 /// Renders the frames of an owner one after another. When its machine crashes, the picture it was at is begun anew.
@@ -183,7 +183,7 @@ fn opened_with(farm: &Rc<Farm>, spec: &v1::FrameSpec, base: &mut Option<Base>, o
     events::note("owner", format_args!("frame {} reads {} records", opened.frame, opened.base_records));
     if let Some(before) = base.as_ref().filter(|before| before.digest != digest) {
         let namespace = namespace(spec.levels);
-        let held = |records: &Vec<(Tag, Irradiance)>| records.iter().all(|(_, r)| farm.is_held(&namespace, r.id));
+        let held = |records: &Vec<(Tag, Record)>| records.iter().all(|(_, r)| farm.is_held(&namespace, r.id()));
         if before.records.as_ref().is_some_and(held) {
             events::wrong("a frame begun again has another base, though its records are held");
         }

@@ -45,7 +45,7 @@ impl Caches {
         check(Digest::default(), base, digest)?;
         *self = Self::new(self.a, self.levels.len() as u32);
         self.file(base);
-        self.base = base.records.iter().map(|(_, r)| r.id).collect();
+        self.base = base.records.iter().map(|(_, r)| r.id()).collect();
         Ok(())
     }
 
@@ -63,17 +63,17 @@ impl Caches {
 
     fn file(&mut self, part: &Part) {
         for (level, sealed) in (1..).zip(&mut self.levels) {
-            let own = part.records.iter().filter(|(tag, r)| tag.level == level && !self.base.contains(&r.id));
-            let own: Vec<_> = own.map(|(_, record)| *record).collect();
-            if !own.is_empty() {
-                Arc::make_mut(sealed).extend(own);
+            let own = part.records.iter().filter(|(tag, r)| tag.level == level && !self.base.contains(&r.id()));
+            let mut own = own.map(|(_, record)| record).peekable();
+            if own.peek().is_some() {
+                Arc::make_mut(sealed).unite(own);
             }
         }
     }
 }
 
 fn check(mut united: Digest, part: &Part, expected: Digest) -> Result<(), ReplicaError> {
-    part.records.iter().for_each(|(_, record)| united.add(record.id));
+    part.records.iter().for_each(|(_, record)| united.add(record.id()));
     if united == expected {
         return Ok(());
     }
@@ -83,7 +83,7 @@ fn check(mut united: Digest, part: &Part, expected: Digest) -> Result<(), Replic
 
 #[cfg(test)]
 mod tests {
-    use cache_core::{Irradiance, Query, Tag};
+    use cache_core::{Query, Record, Tag};
     use glam::Vec3;
     use proptest::prelude::*;
 
@@ -106,11 +106,11 @@ mod tests {
     }
 
     /// Two levels of these records.
-    fn sealed(records: impl IntoIterator<Item = (Tag, Irradiance)>) -> Levels {
+    fn sealed(records: impl IntoIterator<Item = (Tag, Record)>) -> Levels {
         let mut levels: Levels = (0..2).map(|_| Arc::new(Sealed::new(0.8))).collect();
         for (tag, record) in records {
             if let Some(sealed) = levels.get_mut(tag.level as usize - 1) {
-                Arc::make_mut(sealed).extend([record]);
+                Arc::make_mut(sealed).unite([&record]);
             }
         }
         levels
@@ -151,7 +151,7 @@ mod tests {
                     caches.begin(&held_base.prefix(base_end as u64).expect("arrived"), digest(&base)).expect("same base");
                 }
                 let levels = caches.extend(&part, digest(&lower)).expect("same records");
-                let own = lower.into_iter().filter(|(_, r)| base.iter().all(|(_, b)| b.id != r.id));
+                let own = lower.into_iter().filter(|(_, r)| base.iter().all(|(_, b)| b.id() != r.id()));
                 let expected = sealed(base.iter().copied().chain(own));
                 prop_assert_eq!(answers(&levels), answers(&expected));
                 prop_assert_eq!(counts(&levels), counts(&expected));
@@ -161,13 +161,13 @@ mod tests {
 
     #[test]
     fn a_step_adds_no_more_than_it_reads() {
-        let at = |id: u128, step| (Tag { level: 1, step }, record(id, Vec3::ZERO, 1.0));
+        let at = |id: u128, step| (Tag { level: 1, step }, record(id, Vec3::ZERO, 1.0).into());
         let replica = replica(&[at(1, 0), at(4, 2), at(2, 1), at(8, 1)]);
         let mut mark = Mark::default();
         let mut added = |position, step| {
             let part = replica.part(mark, position, step).expect("arrived");
             mark = part.to;
-            (part.anew, part.records.iter().map(|(_, r)| r.id.0 as u64).collect::<Vec<_>>())
+            (part.anew, part.records.iter().map(|(_, r)| r.id().0 as u64).collect::<Vec<_>>())
         };
         assert_eq!(added(2, 1), (true, vec![1]));
         assert_eq!(added(3, 2), (false, vec![2]));
@@ -178,7 +178,7 @@ mod tests {
 
     #[test]
     fn other_records_than_the_servers_are_refused_and_change_nothing() {
-        let at = |id: u128| (Tag { level: 1, step: 0 }, record(id, Vec3::ZERO, 1.0));
+        let at = |id: u128| (Tag { level: 1, step: 0 }, record(id, Vec3::ZERO, 1.0).into());
         let replica = replica(&[at(1), at(2)]);
         let mut caches = Caches::new(0.3, 2);
         let prefix = replica.prefix(1).expect("arrived");

@@ -8,7 +8,7 @@ use std::hash::{BuildHasher as _, Hasher as _};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use cache_core::{Irradiance, Namespace, Tag};
+use cache_core::{Namespace, Record, Tag};
 use cache_proto::{VERSION, v1};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
@@ -313,7 +313,7 @@ impl<J: Job> Worker<J> {
 
     /// Inserts what a lease gathered; says how many bytes of records it sent. A server whose disk is full, or that is
     /// away, is asked again as long as the lease is ours; one that may keep no more records will not keep them later.
-    async fn insert(&self, draft: &Namespace, records: &[(Tag, Irradiance)], dropped: &Dropped) -> Result<u64, Fault> {
+    async fn insert(&self, draft: &Namespace, records: &[(Tag, Record)], dropped: &Dropped) -> Result<u64, Fault> {
         if records.is_empty() {
             return Ok(0);
         }

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use cache_core::{Irradiance, Namespace, RecordId, Tag};
+use cache_core::{Namespace, Record, RecordId, Tag};
 use cache_proto::{convert, v1};
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinHandle;
@@ -150,7 +150,7 @@ impl Follower {
     }
 
     /// The record of an id, from this log or one before it.
-    pub fn known(&self, id: RecordId) -> Option<Irradiance> {
+    pub fn known(&self, id: RecordId) -> Option<Record> {
         let held = lock(&self.held);
         held.replica.get(id).or_else(|| held.aside.as_ref()?.get(id))
     }
@@ -292,7 +292,7 @@ async fn refill(mut cache: Cache, namespace: Namespace, held: Arc<Mutex<Held>>, 
     }
 }
 
-async fn lacking(held: &Arc<Mutex<Held>>, from: usize) -> Option<(Vec<(Tag, Irradiance)>, usize)> {
+async fn lacking(held: &Arc<Mutex<Held>>, from: usize) -> Option<(Vec<(Tag, Record)>, usize)> {
     let held = held.clone();
     let looking = off_thread(move || {
         let held = lock(&held);
@@ -309,13 +309,13 @@ pub struct Kept {
     pub position: u64,
 }
 
-/// Inserts records, each tag's in batches, and waits until the server keeps them. Repeating it is harmless.
+/// Inserts records, each tag's and kind's in batches, and waits until the server keeps them. Repeating it is harmless.
 ///
 /// # Errors
 /// The server's.
-pub async fn insert(cache: &mut Cache, namespace: &Namespace, records: &[(Tag, Irradiance)]) -> Result<Kept, Status> {
+pub async fn insert(cache: &mut Cache, namespace: &Namespace, records: &[(Tag, Record)]) -> Result<Kept, Status> {
     let mut batches = Vec::new();
-    for run in records.chunk_by(|a, b| a.0 == b.0) {
+    for run in records.chunk_by(|a, b| (a.0, a.1.kind()) == (b.0, b.1.kind())) {
         for part in run.chunks(convert::BATCH_RECORDS_MAX) {
             let batch = convert::pack(namespace, part[0].0, part.iter().map(|(_, r)| r));
             batches.push(v1::InsertRequest { batch: Some(batch) });

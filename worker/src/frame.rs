@@ -6,15 +6,17 @@ use std::sync::Arc;
 use cache_core::details::Spacing;
 use cache_core::hemisphere::Strata;
 use cache_core::id::Random;
-use cache_core::{Irradiance, Namespace, Query, RecordId, Sealed, rounds};
+use cache_core::{Irradiance, Namespace, Record, RecordId, Sealed, rounds};
 
 use crate::bsdf::Part;
 use crate::gather::{Gather, Rays, Site};
 use crate::lights::Lights;
 use crate::pixel::{Pixel, deviations};
+use crate::refine::Proposals;
 use crate::sampler::Sampler;
 use crate::scene::{Rgb, Scene};
 use crate::settings::{Method, Settings};
+use crate::task::CpuClock;
 use crate::trace::Tracer;
 use crate::world::World;
 
@@ -75,6 +77,8 @@ pub struct Counts {
     pub surfaces: Sums,
     /// What the others add up to, which look straight into light.
     pub lights: Sums,
+    /// CPU seconds of candidates' tests: whether records cover them, and what shows that records should shrink.
+    pub test_seconds: f64,
 }
 
 /// What pixels add up to.
@@ -117,6 +121,7 @@ impl Counts {
         self.samples += other.samples;
         self.surfaces.add(&other.surfaces);
         self.lights.add(&other.lights);
+        self.test_seconds += other.test_seconds;
     }
 
     /// Counts a finished pixel.
@@ -203,8 +208,8 @@ impl Frame {
     }
 
     /// Tests the candidates of `tile` whose ranks lie in `ranks` and gathers a record of `level` where the sealed
-    /// cache covers none, unless it is `known`. The records depend on nothing but the frame, the other arguments and the
-    /// sealed records.
+    /// cache covers none, unless it is `known`; where it does, an adaptive frame proposes that records shrink which make
+    /// visible steps. What comes of it depends on nothing but the frame, the other arguments and the sealed records.
     pub fn fill(
         &self,
         level: u32,
@@ -212,50 +217,49 @@ impl Frame {
         ranks: Range<u32>,
         tile: u32,
         sealed: &Levels,
-        known: &dyn Fn(RecordId) -> Option<Irradiance>,
-    ) -> (Vec<Irradiance>, Counts) {
+        known: &dyn Fn(RecordId) -> Option<Record>,
+    ) -> (Vec<Record>, Counts) {
         let mut counts = Counts::default();
-        let mut records = Vec::new();
-        for pixel in self.settings.pixels(tile) {
-            if ranks.contains(&rounds::rank(pixel[0], pixel[1]))
-                && let Some(record) = self.candidate(level, pass, pixel, sealed, known, &mut counts)
-            {
-                records.push(record);
+        let adaptive = self.settings.details.adaptive && level == 1;
+        let own = sealed.get(level as usize - 1).filter(|own| !own.is_empty());
+        let tracer = self.tracer(sealed);
+        let (mut uncovered, mut proposals) = (Vec::new(), Proposals::default());
+        let clock = CpuClock::start();
+        for [x, y] in self.settings.pixels(tile).filter(|[x, y]| ranks.contains(&rounds::rank(*x, *y))) {
+            let Some(site) = self.site(level, pass, x, y, &mut counts) else { continue };
+            let covered = match own {
+                Some(own) if adaptive && rounds::refines(level, pass) => {
+                    proposals.test(&tracer, &site, own, &mut counts)
+                }
+                Some(own) => own.covers(&site.query()),
+                None => false,
+            };
+            if !covered {
+                uncovered.push(site);
             }
         }
-        (records, counts)
-    }
-
-    /// Tests one pixel's candidate and gathers its record where the sealed cache covers none.
-    fn candidate(
-        &self,
-        level: u32,
-        pass: u32,
-        [x, y]: [u32; 2],
-        sealed: &Levels,
-        known: &dyn Fn(RecordId) -> Option<Irradiance>,
-        counts: &mut Counts,
-    ) -> Option<Irradiance> {
-        let site = self.site(level, pass, x, y, counts)?;
-        let query = Query { position: site.at.position, normal: site.at.normal() };
-        if sealed.get(level as usize - 1).is_some_and(|s| s.covers(&query)) {
-            return None;
-        }
+        counts.test_seconds += clock.seconds();
         // The level being filled is no business of its own gathers.
         let gather = Gather {
-            tracer: &self.tracer(sealed),
+            tracer: &tracer,
             namespace: &self.namespace,
             seed: self.settings.seed,
             level,
             rays: self.rays(level),
             details: &self.settings.details,
         };
-        let id = gather.id(&site);
-        if let Some(record) = known(id) {
-            counts.reused += 1;
-            return Some(record);
+        let mut records = Vec::with_capacity(uncovered.len());
+        for site in &uncovered {
+            let id = gather.id(site);
+            let found = known(id);
+            counts.reused += u64::from(found.is_some());
+            records.push(found.unwrap_or_else(|| gather.record(id, site, &mut counts).into()));
+            if let Some(own) = own.filter(|_| adaptive) {
+                proposals.begin(id, own.first_a(&site.query()), self.settings.a);
+            }
         }
-        Some(gather.record(id, &site, counts))
+        records.extend(proposals.take().map(Record::from));
+        (records, counts)
     }
 
     /// How many rays a record of a level is made of.
@@ -312,7 +316,7 @@ impl Frame {
                 };
                 let radius_bounds = (radius_min, radius_max.max(radius_min));
                 let reflectance = bsdf.diffuse().element_sum() * (1.0 / 3.0);
-                return (bsdf.diffuse() != Rgb::ZERO).then_some(Site { at, radius_bounds, reflectance });
+                return (bsdf.diffuse() != Rgb::ZERO).then_some(Site { at, direction, radius_bounds, reflectance });
             }
             let [a, b, c, _] = sampler.next4();
             let scatter = bsdf.sample(at.frame.to_local(-direction), Part::All, [a, b, c])?;

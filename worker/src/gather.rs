@@ -4,7 +4,7 @@ use cache_core::details::Details;
 use cache_core::hemisphere::{Estimate, Strata};
 use cache_core::id::{Origin, Random};
 use cache_core::math::Frame;
-use cache_core::{Cached, Irradiance, Namespace, RecordId};
+use cache_core::{Irradiance, Namespace, Packed as _, Query, RecordId};
 use std::f32::consts::SQRT_2;
 
 use glam::{Vec2, Vec3};
@@ -21,6 +21,8 @@ const ELONGATION: f32 = 2.0;
 pub struct Site {
     /// The surface there.
     pub at: Meeting,
+    /// Unit direction of the ray that met it.
+    pub direction: Vec3,
     /// Least and greatest R of the record, world lengths.
     pub radius_bounds: (f32, f32),
     /// Diffuse reflectance, mean of the channels.
@@ -39,6 +41,13 @@ pub enum Rays<'a> {
         /// Rays per W/(sr m²) by which reflected radiance would deviate with one ray.
         per_deviation: f32,
     },
+}
+
+impl Site {
+    /// What a sealed cache is asked there.
+    pub fn query(&self) -> Query {
+        Query { position: self.at.position, normal: self.at.normal() }
+    }
 }
 
 /// What a gather needs besides its site.

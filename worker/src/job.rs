@@ -6,14 +6,14 @@ use std::future::Future;
 use std::ops::Range;
 use std::sync::Arc;
 
-use cache_core::{Irradiance, RecordId};
+use cache_core::{Record, RecordId};
 use cache_proto::v1;
 
 use crate::frame::Levels;
 use crate::task::Done;
 
 /// Finds a record that was gathered under the frame's draft before. The same id has the same bits, whoever made it.
-pub type Known = Arc<dyn Fn(RecordId) -> Option<Irradiance> + Send + Sync>;
+pub type Known = Arc<dyn Fn(RecordId) -> Option<Record> + Send + Sync>;
 
 /// Whether nobody waits for a lease any more.
 pub type Dropped = Arc<dyn Fn() -> bool + Send + Sync>;

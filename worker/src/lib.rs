@@ -13,6 +13,7 @@
 //! - [`trace`]: what a ray sees where it lands: the second door, and the path tracer.
 //! - [`gather`]: a record of irradiance is made.
 //! - [`pixel`]: one pixel as its samples come in.
+//! - [`refine`]: where records make visible steps, and how far they should shrink for that.
 //! - [`frame`]: the two kinds of work a worker leases: filling rounds and making pixels.
 //! - [`pilot`]: settings from an error.
 //! - [`solo`]: a frame without a farm.
@@ -46,6 +47,7 @@ pub mod trace;
 
 pub mod gather;
 pub mod pixel;
+pub mod refine;
 
 pub mod frame;
 

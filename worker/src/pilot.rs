@@ -176,7 +176,7 @@ fn look(frame: &Frame) -> Seen {
     let settings = frame.settings();
     let size = settings.width * settings.height;
     let ranks = (u64::from(RANKS) * u64::from(PIXELS) / u64::from(size.max(1))).clamp(1, RANKS.into()) as u32;
-    let (levels, filling) = solo::fill_ranks(frame, Order::Rounds, ranks);
+    let solo::Filled { levels, counts: filling, .. } = solo::fill_ranks(frame, Order::Rounds, ranks);
     let rays = |counts: &Counts| (counts.path_rays + counts.shadow_rays) as f64;
     let mut seen = Seen { rays_of_fill: rays(&filling), ..Seen::default() };
     let tracer = frame.looking(&levels);

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, HashSet};
 
 use cache_core::id::Digest;
 use cache_core::set::Inserted;
-use cache_core::{Irradiance, Namespace, RecordId, RecordSet, Tag};
+use cache_core::{Namespace, Record, RecordId, RecordSet, Tag};
 use cache_proto::{convert, v1};
 
 /// Why a replica could not take a batch or give a part of its log.
@@ -74,7 +74,7 @@ pub struct Part {
     /// These are all records: the caches start over.
     pub anew: bool,
     /// The records, each id once.
-    pub records: Vec<(Tag, Irradiance)>,
+    pub records: Vec<(Tag, Record)>,
 }
 
 /// A copy of a namespace's log.
@@ -85,7 +85,7 @@ pub struct Part {
 pub struct Replica {
     namespace: Namespace,
     epoch: u64,
-    set: RecordSet<Irradiance>,
+    set: RecordSet,
     /// Positions whose record took the place of an earlier one, and the position of that one.
     replaced: BTreeMap<usize, usize>,
     /// Positions of each step's records, ascending.
@@ -114,7 +114,7 @@ impl Replica {
     }
 
     /// The record of an id.
-    pub fn get(&self, id: RecordId) -> Option<Irradiance> {
+    pub fn get(&self, id: RecordId) -> Option<Record> {
         self.set.get(id).map(|(_, record)| *record)
     }
 
@@ -124,8 +124,7 @@ impl Replica {
     /// # Errors
     /// A batch that is malformed, of another namespace, or leaves a gap; nothing of it is used.
     pub fn apply(&mut self, position: u64, batch: &v1::RecordBatch) -> Result<u64, ReplicaError> {
-        let (namespace, tag, records) =
-            convert::unpack::<Irradiance>(batch).map_err(|e| ReplicaError::Malformed(e.to_string()))?;
+        let (namespace, tag, records) = convert::unpack(batch).map_err(|e| ReplicaError::Malformed(e.to_string()))?;
         if namespace != self.namespace {
             return Err(ReplicaError::Malformed("it is of another namespace".into()));
         }
@@ -140,8 +139,8 @@ impl Replica {
         Ok(self.position())
     }
 
-    fn insert(&mut self, tag: Tag, record: Irradiance) -> Inserted {
-        let (at, earlier) = (self.set.position(), self.set.position_of(record.id));
+    fn insert(&mut self, tag: Tag, record: Record) -> Inserted {
+        let (at, earlier) = (self.set.position(), self.set.position_of(record.id()));
         let inserted = self.set.insert(tag, record);
         if inserted != Inserted::Known {
             self.steps.entry(tag.step).or_default().push(at);
@@ -190,7 +189,7 @@ impl Replica {
     }
 
     /// The entries at `positions`, but those that another one below `end` replaced.
-    fn at(&self, end: usize, positions: impl Iterator<Item = usize>) -> Vec<(Tag, Irradiance)> {
+    fn at(&self, end: usize, positions: impl Iterator<Item = usize>) -> Vec<(Tag, Record)> {
         let gone: HashSet<usize> = self.replaced.range(..end).map(|(_, earlier)| *earlier).collect();
         let log = self.set.since(0);
         positions.filter(|at| !gone.contains(at)).map(|at| log[at]).collect()
@@ -211,15 +210,15 @@ impl Replica {
 
     /// The next records, from position `from` of this log on, that `other` lacks: in the order of this log, at most
     /// `most` (not 0); and where to look next. `None`: it lacks none.
-    pub fn lacking(&self, other: &Self, from: usize, most: usize) -> Option<(Vec<(Tag, Irradiance)>, usize)> {
+    pub fn lacking(&self, other: &Self, from: usize, most: usize) -> Option<(Vec<(Tag, Record)>, usize)> {
         let (mut records, mut next) = (Vec::new(), from);
         for (at, (_, record)) in self.set.since(from).iter().enumerate().map(|(i, entry)| (from + i, entry)) {
             next = at + 1;
             // Each id where it first stood, so that prefixes hold the same ids again, with the entry that counts.
-            if self.replaced.contains_key(&at) || other.set.get(record.id).is_some() {
+            if self.replaced.contains_key(&at) || other.set.get(record.id()).is_some() {
                 continue;
             }
-            records.extend(self.set.get(record.id));
+            records.extend(self.set.get(record.id()));
             if records.len() == most {
                 break;
             }
@@ -230,6 +229,7 @@ impl Replica {
 
 #[cfg(test)]
 pub(crate) mod tests {
+    use cache_core::{Irradiance, Shrink};
     use glam::{Vec2, Vec3};
     use proptest::prelude::*;
 
@@ -254,14 +254,19 @@ pub(crate) mod tests {
     }
 
     /// Few ids, so that replacements are common; steps in any order, as leftovers of an interrupted attempt are.
-    pub(crate) fn entries() -> impl Strategy<Value = Vec<(Tag, Irradiance)>> {
-        let one = (0u128..24, 1u32..4, 0u32..4, prop::array::uniform3(0f32..2.0), 0.2f32..2.0)
-            .prop_map(|(id, level, step, p, radius)| (Tag { level, step }, record(id, Vec3::from(p), radius)));
+    pub(crate) fn entries() -> impl Strategy<Value = Vec<(Tag, Record)>> {
+        let one = (0u128..24, 1u32..4, 0u32..4, prop::array::uniform3(0f32..2.0), 0.2f32..2.0, 0..3).prop_map(
+            |(id, level, step, p, radius, kind)| {
+                let record = record(id, Vec3::from(p), radius);
+                let shrink = Shrink::new(record.id, [0.2, 0.4][(p[0] > 1.0) as usize]);
+                (Tag { level, step }, if kind == 0 { shrink.into() } else { record.into() })
+            },
+        );
         prop::collection::vec(one, 0..40)
     }
 
     /// The server's log after these came.
-    pub(crate) fn server(entries: &[(Tag, Irradiance)]) -> Vec<(Tag, Irradiance)> {
+    pub(crate) fn server(entries: &[(Tag, Record)]) -> Vec<(Tag, Record)> {
         let mut set = RecordSet::default();
         for (tag, record) in entries {
             set.insert(*tag, *record);
@@ -269,27 +274,27 @@ pub(crate) mod tests {
         set.since(0).to_vec()
     }
 
-    pub(crate) fn feed(replica: &mut Replica, log: &[(Tag, Irradiance)]) {
+    pub(crate) fn feed(replica: &mut Replica, log: &[(Tag, Record)]) {
         for (at, (tag, record)) in log.iter().enumerate() {
             replica.apply(at as u64, &convert::pack(&NAMESPACE, *tag, [record])).expect("sound batch");
         }
     }
 
-    pub(crate) fn replica(log: &[(Tag, Irradiance)]) -> Replica {
+    pub(crate) fn replica(log: &[(Tag, Record)]) -> Replica {
         let mut replica = Replica::new(NAMESPACE);
         feed(&mut replica, log);
         replica
     }
 
     /// Each id's last entry in a piece of the log, which is the one that counts.
-    pub(crate) fn latest(log: &[(Tag, Irradiance)]) -> Vec<(Tag, Irradiance)> {
-        let counts = |at: usize| log[at + 1..].iter().all(|(_, later)| later.id != log[at].1.id);
+    pub(crate) fn latest(log: &[(Tag, Record)]) -> Vec<(Tag, Record)> {
+        let counts = |at: usize| log[at + 1..].iter().all(|(_, later)| later.id() != log[at].1.id());
         (0..log.len()).filter(|at| counts(*at)).map(|at| log[at]).collect()
     }
 
-    pub(crate) fn digest(records: &[(Tag, Irradiance)]) -> Digest {
+    pub(crate) fn digest(records: &[(Tag, Record)]) -> Digest {
         let mut digest = Digest::default();
-        records.iter().for_each(|(_, r)| digest.add(r.id));
+        records.iter().for_each(|(_, r)| digest.add(r.id()));
         digest
     }
 
@@ -324,7 +329,7 @@ pub(crate) mod tests {
             }
             prop_assert!(aside.lacking(&there, 0, most).is_none());
             for (_, record) in &lost {
-                prop_assert!(there.get(record.id).is_some());
+                prop_assert!(there.get(record.id()).is_some());
             }
         }
 
@@ -351,7 +356,7 @@ pub(crate) mod tests {
                 prop_assert!(prefixes.contains(&digest(&latest(&log[..end]))), "prefix of {}", end);
             }
             for (tag, record) in latest(&log) {
-                prop_assert_eq!(there.set.get(record.id), Some(&(tag, record)));
+                prop_assert_eq!(there.set.get(record.id()), Some(&(tag, record)));
             }
         }
 

@@ -1,12 +1,14 @@
 //! A frame without a farm: filled and finished in this process, for tests, charts and comparisons.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use cache_core::Sealed;
 use cache_core::rounds::{Plan, RANKS, Step};
+use cache_core::{Record, Sealed};
 use rayon::prelude::*;
 
 use crate::frame::{CHANNELS, Counts, Frame, Levels};
+use crate::task::CpuClock;
 
 /// In which order candidates are tested.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -18,20 +20,35 @@ pub enum Order {
     Sequential,
 }
 
+/// A frame filled, and what that took.
+pub struct Filled {
+    /// Its records.
+    pub levels: Levels,
+    /// What was counted.
+    pub counts: Counts,
+    /// Passes over level 1.
+    pub passes: u32,
+    /// Proposals that records shrink.
+    pub proposals: u64,
+    /// CPU seconds of sealing, of the thread that asks.
+    pub sealing_seconds: f64,
+}
+
 /// Fills every level of a frame.
 pub fn fill(frame: &Frame, order: Order) -> Levels {
-    fill_ranks(frame, order, RANKS).0
+    fill_ranks(frame, order, RANKS).levels
 }
 
 /// Fills every level of a frame as far as pixels of ranks below `end` want it; fewer than all in one pass.
-pub fn fill_ranks(frame: &Frame, order: Order, end: u32) -> (Levels, Counts) {
-    let mut counts = Counts::default();
+pub fn fill_ranks(frame: &Frame, order: Order, end: u32) -> Filled {
     let (a, details) = (frame.settings().a, frame.settings().details);
     let mut levels: Levels = (0..frame.levels()).map(|_| Arc::new(Sealed::with(a, details))).collect();
-    let mut plan = Plan::new(frame.levels());
+    let (mut counts, mut passes, mut proposals, mut sealing_seconds) = (Counts::default(), 0, 0, 0.0);
+    let mut plan = Plan::new(frame.levels(), details.adaptive);
     let mut gathered = 0;
     while let Some(Step::Fill { level, pass, ranks }) = plan.next(gathered) {
         gathered = 0;
+        passes += u32::from(level == 1 && ranks.start == 0);
         if end < RANKS && (pass > 0 || ranks.start >= end) {
             continue;
         }
@@ -46,14 +63,21 @@ pub fn fill_ranks(frame: &Frame, order: Order, end: u32) -> (Levels, Counts) {
             for tiles in chunks(frame.settings().tiles(), chunk) {
                 let work = |tile| frame.fill(level, pass, ranks.clone(), tile, &levels, &|_| None);
                 let done: Vec<_> = tiles.into_par_iter().map(work).collect();
-                done.iter().for_each(|(_, counted)| counts.add(counted));
-                let new: Vec<_> = done.into_iter().flat_map(|(records, _)| records).collect();
-                gathered += new.len() as u64;
-                Arc::make_mut(&mut levels[level as usize - 1]).extend(new);
+                // Two tiles may propose the same.
+                let mut new = BTreeMap::new();
+                for (records, counted) in done {
+                    counts.add(&counted);
+                    gathered += records.len() as u64;
+                    new.extend(records.into_iter().map(|record| (record.id(), record)));
+                }
+                proposals += new.values().filter(|record| matches!(record, Record::Shrink(_))).count() as u64;
+                let clock = CpuClock::start();
+                Arc::make_mut(&mut levels[level as usize - 1]).unite(new.values());
+                sealing_seconds += clock.seconds();
             }
         }
     }
-    (levels, counts)
+    Filled { levels, counts, passes, proposals, sealing_seconds }
 }
 
 fn chunks(tiles: u32, size: u32) -> impl Iterator<Item = std::ops::Range<u32>> {

@@ -38,6 +38,7 @@ fn written(settings: &Settings, levels: u32, namespace: &Namespace, path: &str, 
         seed: settings.seed,
         levels,
         effort: settings.effort.map(|Effort { rays, least_rays, samples }| v1::Effort { rays, samples, least_rays }),
+        adaptive: settings.details.adaptive,
     }
 }
 
@@ -70,7 +71,7 @@ pub fn settings(spec: &v1::FrameSpec) -> Result<Settings, String> {
         bounces: spec.bounces,
         seed: spec.seed,
         effort: spec.effort.map(|v1::Effort { rays, samples, least_rays }| Effort { rays, least_rays, samples }),
-        details: Details::default(),
+        details: Details { adaptive: spec.adaptive, ..Details::default() },
     };
     check(&settings)?;
     if spec.tile_size != TILE {

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use anyhow::Context as _;
 use cache_core::rounds::Step;
-use cache_core::{Irradiance, Tag};
+use cache_core::{Record, Tag};
 use cache_proto::{convert, v1};
 
 use crate::frame::{Counts, Frame, Sums};
@@ -15,8 +15,8 @@ use crate::{scene, spec};
 /// What came of a lease.
 #[derive(Default)]
 pub struct Done {
-    /// Records of the candidates that none covered, gathered or found.
-    pub records: Vec<(Tag, Irradiance)>,
+    /// Records of the candidates that none covered, gathered or found, and proposals that records shrink.
+    pub records: Vec<(Tag, Record)>,
     /// Finished tiles.
     pub tiles: Vec<v1::FrameTile>,
     /// What was counted.
@@ -92,17 +92,21 @@ fn run(frame: &Frame, work: &Work) -> Option<Done> {
 
 impl Done {
     /// The counts of `Complete`: `cpu_seconds.PHASE`, `records.PHASE`, `rays.path.PHASE`, `rays.shadow.PHASE` (PHASE is
-    /// `level N` or `pixels`), `queries`, `misses`, `reused` (of the records, those found), and of bytes on the wire `bytes.inserted` and `bytes.subscribed`
-    /// (packed records), `bytes.tiles` (packed pixels).
+    /// `level N` or `pixels`), `cpu_seconds.tests` (of those of the levels, what was not spent on gathers), `proposals`,
+    /// `queries`, `misses`, `reused` (of the records, those found), and of bytes on the wire `bytes.inserted` and
+    /// `bytes.subscribed` (packed records), `bytes.tiles` (packed pixels).
     pub fn counts(&self, step: &v1::Step, inserted: u64, subscribed: u64) -> Vec<v1::Count> {
         let phase = match step.level {
             0 => "pixels".to_string(),
             level => format!("level {level}"),
         };
+        let proposals = self.records.iter().filter(|(_, r)| matches!(r, Record::Shrink(_))).count();
         let tiles: usize = self.tiles.iter().map(|t| t.pixels.len()).sum();
         let all = [
             (format!("cpu_seconds.{phase}"), self.cpu_seconds),
-            (format!("records.{phase}"), self.records.len() as f64),
+            ("cpu_seconds.tests".into(), self.counts.test_seconds),
+            (format!("records.{phase}"), (self.records.len() - proposals) as f64),
+            ("proposals".into(), proposals as f64),
             (format!("rays.path.{phase}"), self.counts.path_rays as f64),
             (format!("rays.shadow.{phase}"), self.counts.shadow_rays as f64),
             ("queries".into(), self.counts.queries as f64),
@@ -186,7 +190,7 @@ mod tests {
         let camera = scene.cameras[0].clone();
         let frame = Frame::new(scene, Settings { rays: 64, ..Settings::new(camera, 16, 16) });
         let step = v1::Step { index: 5, level: 1, rank_to: 4096, ..Default::default() };
-        let lease = |known: BTreeMap<RecordId, Irradiance>| {
+        let lease = |known: BTreeMap<RecordId, Record>| {
             let known = Arc::new(move |id| known.get(&id).copied());
             let (levels, dropped) = (Vec::new(), Arc::new(|| false));
             run(&frame, &Work { step: step.clone(), tiles: 0..1, levels, known, dropped }).expect("not dropped")
@@ -194,10 +198,10 @@ mod tests {
         let first = lease(BTreeMap::new());
         assert!(first.records.len() > 100 && first.counts.reused == 0);
         assert!(first.records.iter().all(|(tag, _)| *tag == Tag { level: 1, step: 5 }));
-        let again = lease(first.records.iter().map(|(_, r)| (r.id, *r)).collect());
+        let again = lease(first.records.iter().map(|(_, r)| (r.id(), *r)).collect());
         assert_eq!((&again.records, again.counts.reused), (&first.records, first.records.len() as u64));
         assert!(again.counts.path_rays * 10 < first.counts.path_rays);
-        let half = lease(first.records.iter().step_by(2).map(|(_, r)| (r.id, *r)).collect());
+        let half = lease(first.records.iter().step_by(2).map(|(_, r)| (r.id(), *r)).collect());
         assert_eq!((half.records, half.counts.reused), (first.records, again.counts.reused.div_ceil(2)));
     }
 }

@@ -10,11 +10,13 @@ use std::f32::consts::FRAC_1_PI;
 
 use cache_core::Query;
 use cache_core::hemisphere::{Sample, Strata, irradiance};
+use cache_core::id::Random;
 use cache_core::irradiance::Answer;
 use glam::{Vec2, Vec3};
 
 use crate::bsdf::{Bsdf, Part};
 use crate::frame::{Counts, Levels};
+use crate::gather::Site;
 use crate::lights::{Lights, Place};
 use crate::math::Frame;
 use crate::sampler::Sampler;
@@ -26,6 +28,9 @@ const SURE_DEPTH: u32 = 3;
 
 /// Chance at most with which Russian roulette lets a path go on: every path ends.
 const SURVIVAL_MAX: f32 = 0.95;
+
+/// Shadow rays that tell how much light there is at a point.
+const DIRECT_LOOKS: u32 = 4;
 
 /// All a ray needs to know.
 pub struct Tracer<'a> {
@@ -212,6 +217,17 @@ impl Tracer<'_> {
             Sample { direction: local, radiance: seen.total(), distance: seen.distance.max(1e-30) }
         };
         (0..strata.rays()).map(&mut ray).collect()
+    }
+
+    /// Light without bounce that leaves a site for the camera, W/(sr m²).
+    pub fn direct(&self, site: &Site, bsdf: &Bsdf, counts: &mut Counts) -> Rgb {
+        let (at, p) = (&site.at, site.at.position);
+        let mut random = Random::named("direct", &p.to_array().map(|v| v.to_bits().into()));
+        let mut looks = || std::array::from_fn(|_| random.uniform());
+        let lamps: Rgb = (0..DIRECT_LOOKS)
+            .map(|_| self.lamps(at, bsdf, at.frame.to_local(-site.direction), Part::Gloss, looks(), counts))
+            .sum();
+        self.emitted(at, site.direction, Chance::All) + lamps / DIRECT_LOOKS as f32
     }
 
     /// Reflected light of one lamp looked for by a shadow ray. `part` is what will be followed by chance as well.

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use cache_core::id::Digest;
-use cache_core::{Irradiance, Namespace, RecordId, Tag};
+use cache_core::{Irradiance, Namespace, Record, RecordId, Tag};
 use cache_proto::{convert, v1};
 use glam::{Vec2, Vec3};
 use script::{Script, State};
@@ -20,7 +20,7 @@ use worker::task::Done;
 const SCENE: Namespace = Namespace([1; 32]);
 const DRAFT: Namespace = Namespace([2; 32]);
 
-fn entry(id: u128, step: u32) -> (Tag, Irradiance) {
+fn entry(id: u128, step: u32) -> (Tag, Record) {
     let record = Irradiance {
         id: RecordId(id),
         position: Vec3::ZERO,
@@ -34,7 +34,7 @@ fn entry(id: u128, step: u32) -> (Tag, Irradiance) {
         ellipse: [0.0; 3],
         noise: 0.0,
     };
-    (Tag { level: 1, step }, record)
+    (Tag { level: 1, step }, record.into())
 }
 
 fn digest(ids: &[u128]) -> Digest {
@@ -63,7 +63,7 @@ impl Job for Tiles {
         let mut done = Done::default();
         for tile in work.tiles {
             let new = entry(1000 + u128::from(tile), work.step.index);
-            match (work.known)(new.1.id) {
+            match (work.known)(new.1.id()) {
                 Some(_) => done.counts.reused += 1,
                 None => done.counts.path_rays += 1,
             }

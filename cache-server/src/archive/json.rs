@@ -3,7 +3,7 @@
 
 use std::io::{self, BufRead, Read as _, Write};
 
-use cache_core::{Cached as _, Irradiance, RecordId, Tag};
+use cache_core::{Irradiance, Record, RecordId, Shrink, Tag};
 use cache_proto::convert::{self, Checked};
 use cache_proto::v1::entry::Entry as Kind;
 use cache_proto::v1::{Entry, Label, Publication};
@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 /// Most bytes of a line: a label with the longest names has less.
 const LINE_MAX: usize = 64 << 10;
 
-/// What an object is.
+/// What an object is, and of a record its kind.
 #[derive(Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 enum Type {
@@ -23,17 +23,27 @@ enum Type {
     Publication,
 }
 
+/// Of what kind a record is.
+#[derive(Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum RecordKind {
+    Irradiance,
+    Shrink,
+}
+
 #[derive(Deserialize)]
 struct Head {
     r#type: Type,
+    /// Records have one.
+    kind: Option<RecordKind>,
 }
 
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct RecordLine {
+struct IrradianceLine {
     r#type: Type,
     namespace: String,
-    kind: String,
+    kind: RecordKind,
     level: u32,
     step: u32,
     id: String,
@@ -47,6 +57,19 @@ struct RecordLine {
     gradient_r: [[f32; 2]; 3],
     ellipse: [f32; 3],
     noise: f32,
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ShrinkLine {
+    r#type: Type,
+    namespace: String,
+    kind: RecordKind,
+    level: u32,
+    step: u32,
+    id: String,
+    of: String,
+    a: f32,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -75,9 +98,6 @@ struct PublicationLine {
     namespace: String,
 }
 
-/// The only kind of record there is.
-const IRRADIANCE: &str = "irradiance";
-
 /// Writes the lines of a sound entry.
 ///
 /// # Errors
@@ -88,10 +108,15 @@ pub fn write(out: &mut impl Write, entry: &Entry) -> io::Result<()> {
         bytes.push(b'\n');
         out.write_all(&bytes)
     };
-    match convert::entry::<Irradiance>(entry).map_err(io::Error::other)? {
+    match convert::entry(entry).map_err(io::Error::other)? {
         Checked::Batch(namespace, tag, records) => {
             let namespace = hex::encode(namespace.0);
-            records.iter().try_for_each(|r| line(serde_json::to_vec(&record_line(&namespace, tag, r))))
+            records.iter().try_for_each(|record| {
+                line(match record {
+                    Record::Irradiance(r) => serde_json::to_vec(&irradiance_line(&namespace, tag, r)),
+                    Record::Shrink(r) => serde_json::to_vec(&shrink_line(&namespace, tag, r)),
+                })
+            })
         }
         Checked::Label(_, _, label) => line(serde_json::to_vec(&LabelLine {
             r#type: Type::Label,
@@ -139,16 +164,24 @@ pub fn read(mut file: impl BufRead, each: &mut dyn FnMut(Entry) -> Result<(), St
 }
 
 fn entry(line: &[u8]) -> Result<Entry, String> {
-    let entry = match parse::<Head>(line)?.r#type {
+    let head = parse::<Head>(line)?;
+    let entry = match head.r#type {
         Type::Record => {
-            let line: RecordLine = parse(line)?;
-            if line.kind != IRRADIANCE {
-                return Err(format!("kind: expected {IRRADIANCE:?}, got {:?}", line.kind));
-            }
-            let record = record(&line)?;
+            let (namespace, tag, record) = match head.kind.ok_or("kind: missing")? {
+                RecordKind::Irradiance => {
+                    let line: IrradianceLine = parse(line)?;
+                    let record = irradiance(&line)?;
+                    (line.namespace, Tag { level: line.level, step: line.step }, Record::from(record))
+                }
+                RecordKind::Shrink => {
+                    let line: ShrinkLine = parse(line)?;
+                    let shrink = Shrink { id: id("id", &line.id)?, of: id("of", &line.of)?, a: line.a };
+                    (line.namespace, Tag { level: line.level, step: line.step }, Record::from(shrink))
+                }
+            };
             record.check().map_err(|invalid| invalid.to_string())?;
-            let namespace = convert::namespace(&bytes("namespace", &line.namespace)?).map_err(|e| e.to_string())?;
-            Kind::Batch(convert::pack(&namespace, Tag { level: line.level, step: line.step }, [&record]))
+            let namespace = convert::namespace(&bytes("namespace", &namespace)?).map_err(|e| e.to_string())?;
+            Kind::Batch(convert::pack(&namespace, tag, [&record]))
         }
         Type::Label => {
             let line: LabelLine = parse(line)?;
@@ -195,14 +228,37 @@ fn bytes(field: &str, text: &str) -> Result<Vec<u8>, String> {
     hex::decode(text).map_err(|error| format!("{field}: expected hexadecimal digits: {error}"))
 }
 
-fn record_line(namespace: &str, tag: Tag, r: &Irradiance) -> RecordLine {
-    RecordLine {
+fn shrink_line(namespace: &str, tag: Tag, shrink: &Shrink) -> ShrinkLine {
+    ShrinkLine {
         r#type: Type::Record,
         namespace: namespace.into(),
-        kind: IRRADIANCE.into(),
+        kind: RecordKind::Shrink,
         level: tag.level,
         step: tag.step,
-        id: format!("{:032x}", r.id().0),
+        id: digits(shrink.id),
+        of: digits(shrink.of),
+        a: shrink.a,
+    }
+}
+
+/// An id's 32 digits, most significant first.
+fn digits(RecordId(id): RecordId) -> String {
+    format!("{id:032x}")
+}
+
+fn id(field: &str, text: &str) -> Result<RecordId, String> {
+    let id = <[u8; 16]>::try_from(bytes(field, text)?);
+    id.map(|id| RecordId(u128::from_be_bytes(id))).map_err(|_| format!("{field}: expected 32 hexadecimal digits"))
+}
+
+fn irradiance_line(namespace: &str, tag: Tag, r: &Irradiance) -> IrradianceLine {
+    IrradianceLine {
+        r#type: Type::Record,
+        namespace: namespace.into(),
+        kind: RecordKind::Irradiance,
+        level: tag.level,
+        step: tag.step,
+        id: digits(r.id),
         position: r.position.into(),
         normal: r.normal.into(),
         radius: r.radius,
@@ -216,11 +272,9 @@ fn record_line(namespace: &str, tag: Tag, r: &Irradiance) -> RecordLine {
     }
 }
 
-fn record(line: &RecordLine) -> Result<Irradiance, String> {
-    let id = bytes("id", &line.id)?;
-    let id = <[u8; 16]>::try_from(id).map_err(|_| "id: expected 32 hexadecimal digits".to_string())?;
+fn irradiance(line: &IrradianceLine) -> Result<Irradiance, String> {
     Ok(Irradiance {
-        id: RecordId(u128::from_be_bytes(id)),
+        id: id("id", &line.id)?,
         position: Vec3::from(line.position),
         normal: Vec3::from(line.normal),
         radius: line.radius,

@@ -14,7 +14,7 @@ use std::io;
 use std::path::Path;
 
 use cache_core::id::Digest;
-use cache_core::{Irradiance, Namespace, RecordSet, Tag};
+use cache_core::{Namespace, Record, RecordSet, Tag};
 use cache_proto::convert::{self, BATCH_RECORDS_MAX, Checked, Malformed};
 use cache_proto::v1;
 use cache_proto::v1::entry::Entry as Kind;
@@ -111,7 +111,7 @@ impl Archive {
         self.publications.len()
     }
 
-    fn summary(&self, namespace: &Namespace, set: &RecordSet<Irradiance>) -> Summary {
+    fn summary(&self, namespace: &Namespace, set: &RecordSet) -> Summary {
         let label = self.replica.label_of(namespace).cloned();
         let draft_of = label.as_ref().and_then(|label| convert::namespace(&label.draft_of).ok());
         let mut levels = BTreeMap::new();
@@ -122,12 +122,12 @@ impl Archive {
         Summary { namespace: *namespace, label, draft_of, levels, digest, conflicts }
     }
 
-    fn sets(&self) -> impl Iterator<Item = (&Namespace, &RecordSet<Irradiance>)> {
+    fn sets(&self) -> impl Iterator<Item = (&Namespace, &RecordSet)> {
         self.replica.namespaces().filter_map(|namespace| Some((namespace, self.replica.set(namespace)?)))
     }
 
     /// Calls `each` with entries that amount to this archive, in canonical order: namespaces in byte order, each with
-    /// its label, then its records by level, step and id; then the publications.
+    /// its label, then its records by level, step, kind and id; then the publications.
     ///
     /// # Errors
     /// The first of `each`.
@@ -138,8 +138,8 @@ impl Archive {
                 each(Kind::Label(label.clone()))?;
             }
             let mut records: Vec<_> = held(set).collect();
-            records.sort_by_key(|(tag, record)| (*tag, record.id));
-            for run in records.chunk_by(|a, b| a.0 == b.0) {
+            records.sort_by_key(|(tag, record)| (*tag, record.kind(), record.id()));
+            for run in records.chunk_by(|a, b| (a.0, a.1.kind()) == (b.0, b.1.kind())) {
                 for batch in run.chunks(BATCH_RECORDS_MAX) {
                     let records = batch.iter().map(|(_, record)| record);
                     each(Kind::Batch(convert::pack(namespace, batch[0].0, records)))?;
@@ -155,11 +155,11 @@ impl Archive {
 
     /// What of a sound entry is not here.
     fn lacks(&self, entry: v1::Entry) -> Option<v1::Entry> {
-        let Ok(checked) = convert::entry::<Irradiance>(&entry) else { return None };
+        let Ok(checked) = convert::entry(&entry) else { return None };
         match checked {
             Checked::Batch(namespace, tag, records) => {
                 let set = self.replica.set(&namespace);
-                let here = |record: &Irradiance| set.and_then(|set| set.get(record.id)) == Some(&(tag, *record));
+                let here = |record: &Record| set.and_then(|set| set.get(record.id())) == Some(&(tag, *record));
                 let new: Vec<_> = records.into_iter().filter(|record| !here(record)).collect();
                 let batch = (!new.is_empty()).then(|| convert::pack(&namespace, tag, &new));
                 batch.map(|batch| v1::Entry { entry: Some(Kind::Batch(batch)) })
@@ -173,8 +173,8 @@ impl Archive {
 }
 
 /// The records of a set, replaced ones left out.
-fn held(set: &RecordSet<Irradiance>) -> impl Iterator<Item = &(Tag, Irradiance)> {
-    set.since(0).iter().filter(|record| set.get(record.1.id).is_some_and(|held| std::ptr::eq(held, *record)))
+fn held(set: &RecordSet) -> impl Iterator<Item = &(Tag, Record)> {
+    set.since(0).iter().filter(|record| set.get(record.1.id()).is_some_and(|held| std::ptr::eq(held, *record)))
 }
 
 #[cfg(test)]

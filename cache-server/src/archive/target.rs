@@ -68,7 +68,7 @@ impl Archive {
     pub fn add_to(&self, path: &Path) -> Result<(u64, Report), ArchiveError> {
         if free(path).is_ok() {
             self.make(path)?;
-            let count = |set: &cache_core::RecordSet<_>| set.len() as u64;
+            let count = |set: &cache_core::RecordSet| set.len() as u64;
             return Ok((self.sets().map(|(_, set)| count(set)).sum(), Report::default()));
         }
         let failed = |error: io::Error| ArchiveError::failed(path, &error);

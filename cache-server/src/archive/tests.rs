@@ -1,7 +1,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use cache_core::RecordId;
+use cache_core::{Irradiance, RecordId, Shrink};
 use glam::{Vec2, Vec3};
 use proptest::prelude::*;
 
@@ -35,6 +35,12 @@ fn batch(namespace: Namespace, level: u32, step: u32, records: &[Irradiance]) ->
     v1::Entry { entry: Some(Kind::Batch(convert::pack(&namespace, Tag { level, step }, records))) }
 }
 
+fn proposals(namespace: Namespace, step: u32, of: &[(u32, u8)]) -> v1::Entry {
+    let shrink = |&(of, a): &(u32, u8)| Shrink::new(record(of, 0.0).id, 0.1 + f32::from(a));
+    let shrinks: Vec<_> = of.iter().map(shrink).collect();
+    v1::Entry { entry: Some(Kind::Batch(convert::pack(&namespace, Tag { level: 1, step }, &shrinks))) }
+}
+
 fn label(namespace: Namespace, draft_of: Option<Namespace>) -> v1::Entry {
     let draft_of = draft_of.map_or(Vec::new(), |of| of.0.to_vec()).into();
     v1::Entry {
@@ -63,6 +69,7 @@ fn publication(draft: Namespace, namespace: Namespace) -> v1::Entry {
 fn entries() -> impl Strategy<Value = Vec<v1::Entry>> {
     let namespace = || prop::sample::select(vec![NAMESPACE, DRAFT, OTHER]);
     let records = prop::collection::vec((0..30u32, 0..2u8), 0..8);
+    let shrinks = (namespace(), 0..3u32, records.clone()).prop_map(|(n, step, of)| proposals(n, step, &of));
     let batch = (namespace(), 1..3u32, 0..3u32, records).prop_map(|(namespace, level, step, records)| {
         let records: Vec<_> = records.iter().map(|&(id, x)| record(id, x.into())).collect();
         batch(namespace, level, step, &records)
@@ -72,7 +79,7 @@ fn entries() -> impl Strategy<Value = Vec<v1::Entry>> {
         label(DRAFT, Some(NAMESPACE)),
         publication(DRAFT, NAMESPACE),
     ]);
-    prop::collection::vec(prop_oneof![5 => batch, 1 => rare], 0..12)
+    prop::collection::vec(prop_oneof![5 => batch, 2 => shrinks, 1 => rare], 0..12)
 }
 
 fn archive(entries: &[v1::Entry]) -> Archive {
@@ -211,10 +218,13 @@ fn what_is_wrong_with_a_line_is_named() {
     let mut count = 0;
     json::read(sound.as_bytes(), &mut |entry| {
         count += 1;
-        convert::entry::<Irradiance>(&entry).map(drop).map_err(|error| error.to_string())
+        convert::entry(&entry).map(drop).map_err(|error| error.to_string())
     })
     .expect("sound");
     assert_eq!(count, 3);
+    let mut shrink = Vec::new();
+    json::write(&mut shrink, &proposals(NAMESPACE, 2, &[(1, 0)])).expect("memory");
+    let sound = format!("{sound}{}", String::from_utf8(shrink).expect("text"));
     let sevens = "07".repeat(32);
     for (from, to, says) in [
         ("\"radius\":0.1", "\"radius\":-1", "line 1: radius is -1, expected more than 0"),
@@ -227,15 +237,23 @@ fn what_is_wrong_with_a_line_is_named() {
         ("\"level\":1", "\"level\":65", "line 1: level is 65"),
         ("\"id\":\"0", "\"id\":\"", "line 1: id: expected hexadecimal digits"),
         (sevens.as_str(), "0707", "line 1: namespace has 2 bytes, expected 32"),
-        ("irradiance\",\"level", "radiance\",\"level", "line 1: kind: expected \"irradiance\""),
+        (
+            "irradiance\",\"level",
+            "radiance\",\"level",
+            "line 1: kind: unknown variant `radiance`, expected `irradiance` or `shrink`",
+        ),
         ("\"seed\":18446744073709551615", "\"seed\":-1", "line 2: seed: "),
         ("{\"type\":\"label\"", "{\"type\":\"lable\"", "line 2: type: unknown variant `lable`"),
+        ("\"kind\":\"shrink\",", "", "line 4: kind: missing"),
+        ("\"of\":\"", "\"of\":\"0", "line 4: of: expected hexadecimal digits"),
+        ("\"of\":\"0000", "\"of\":\"1000", "line 4: id is not that of the content"),
+        ("\"a\":0.1}", "\"a\":11}", "line 4: a is 11, expected more than 0 and at most 10"),
         ("{\"type\":\"publication\"", "[", "line 3: "),
         ("{\"type\":\"publication\"", "{}\n{\"type\":\"publication\"", "line 3: missing field `type`"),
     ] {
         let spoilt = sound.replacen(from, to, 1);
         assert_ne!(spoilt, sound, "{from}");
-        let check = &mut |entry| convert::entry::<Irradiance>(&entry).map(drop).map_err(|error| error.to_string());
+        let check = &mut |entry| convert::entry(&entry).map(drop).map_err(|error| error.to_string());
         let error = json::read(spoilt.as_bytes(), check).expect_err(to);
         assert!(error.starts_with(says), "{to}: {error}");
     }

@@ -16,7 +16,7 @@
 
 use std::io;
 
-use cache_core::{Cached as _, Irradiance};
+use cache_core::Record;
 use cache_proto::v1;
 use cache_proto::v1::entry::Entry as Kind;
 use prost::Message as _;
@@ -234,7 +234,7 @@ pub fn entries(mut payload: &[u8]) -> impl Iterator<Item = Result<v1::Entry, Uns
 /// How many records an entry holds.
 pub fn records(entry: &v1::Entry) -> u64 {
     match &entry.entry {
-        Some(Kind::Batch(batch)) => (batch.records.len() / Irradiance::BYTES) as u64,
+        Some(Kind::Batch(batch)) => Record::bytes(batch.kind).map_or(0, |size| batch.records.len() / size) as u64,
         _ => 0,
     }
 }

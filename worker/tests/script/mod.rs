@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use cache_core::id::Digest;
 use cache_core::set::Inserted;
-use cache_core::{Irradiance, Namespace, RecordSet, Tag};
+use cache_core::{Namespace, Record, RecordSet, Tag};
 use cache_proto::{convert, v1};
 use tokio::sync::{mpsc, watch};
 use tokio_stream::wrappers::ReceiverStream;
@@ -17,7 +17,7 @@ use tonic::transport::Server;
 use tonic::{Request, Response, Status, Streaming};
 use worker::client::Line;
 
-type Log = RecordSet<Irradiance>;
+type Log = RecordSet;
 
 #[derive(Default)]
 pub struct State {
@@ -97,7 +97,7 @@ impl Script {
     }
 
     /// Inserts as some other worker does.
-    pub fn insert(&self, namespace: Namespace, records: &[(Tag, Irradiance)]) {
+    pub fn insert(&self, namespace: Namespace, records: &[(Tag, Record)]) {
         self.with(|state| {
             let log = state.logs.entry(namespace).or_default();
             records.iter().for_each(|(tag, record)| _ = log.insert(*tag, *record));
@@ -106,7 +106,7 @@ impl Script {
 
     /// The ids of a log, in its order.
     pub fn ids(&self, namespace: Namespace) -> Vec<u128> {
-        self.lock().logs.get(&namespace).map_or(Vec::new(), |log| log.since(0).iter().map(|(_, r)| r.id.0).collect())
+        self.lock().logs.get(&namespace).map_or(Vec::new(), |log| log.since(0).iter().map(|(_, r)| r.id().0).collect())
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
@@ -132,7 +132,7 @@ impl v1::cache_server::Cache for Script {
         let mut stream = request.into_inner();
         let mut batches = Vec::new();
         while let Some(request) = stream.message().await? {
-            batches.push(convert::unpack::<Irradiance>(&request.batch.expect("a batch")).expect("sound"));
+            batches.push(convert::unpack(&request.batch.expect("a batch")).expect("sound"));
         }
         self.with(|state| {
             if let Some(refusal) = state.refusals.pop_front() {
