@@ -244,6 +244,10 @@ impl Irradiance {
         }
         positive("radius", self.radius)?;
         positive("radius_min", self.radius_min)?;
+        if self.radius_max <= RADIUS_LEAST * reach {
+            let expected = "more than 2^-32 of its distance from the origin";
+            return Err(Invalid::Range { field: "radius_max", value: self.radius_max, expected });
+        }
         // Far below the spacing of floats there, R tells nothing; clamped by it, all records around would be worth nothing.
         if self.radius <= RADIUS_LEAST * reach.max(self.radius_max) {
             let expected = "more than 2^-32 of its distance from the origin and of radius_max";
@@ -311,7 +315,7 @@ mod tests {
     #[test]
     fn unsound_records_are_refused_by_name() {
         type Spoil = fn(&mut Irradiance);
-        let spoilt: [(&str, Spoil); 13] = [
+        let spoilt: [(&str, Spoil); 14] = [
             ("position", |r| r.position.x = f32::NAN),
             ("gradient_r", |r| r.gradient_r[2].y = f32::INFINITY),
             ("radius", |r| r.radius = f32::INFINITY),
@@ -322,6 +326,7 @@ mod tests {
             ("radius", |r| (r.position, r.radius) = (Vec3::Y * -1e6, 1e-4)),
             ("radius_min", |r| r.radius_min = -1.0),
             ("radius_max", |r| r.radius_max = 0.01),
+            ("radius_max", |r| (r.radius_min, r.radius_max) = (1e-40, 1e-19)),
             ("ellipse", |r| r.ellipse = [1.0, 2.0, 1.0]),
             ("ellipse", |r| r.ellipse = [1.0, 0.0, f32::NAN]),
             ("noise", |r| r.noise = -1.0),

@@ -146,6 +146,32 @@ async fn metrics_tell_what_happened() {
     server.wait().expect("ended");
 }
 
+#[test]
+fn who_stalls_where_metrics_are_read_is_cut_and_others_have_their_turn() {
+    let free = TcpListener::bind("127.0.0.1:0").expect("a port").local_addr().expect("bound").to_string();
+    let (mut server, _) = start(&["--metrics", &free]);
+    // Half a request, on more connections than are read at a time.
+    let stalled: Vec<_> = (0..20)
+        .map(|_| {
+            let mut stream = TcpStream::connect(&free).expect("connected");
+            stream.write_all(b"GET /metrics HT").expect("sent");
+            stream.set_read_timeout(Some(support::PATIENCE)).expect("a socket");
+            stream
+        })
+        .collect();
+    let page = std::thread::spawn(move || metrics(&free));
+    for mut stream in stalled {
+        let mut rest = Vec::new();
+        // Cut, in whatever way.
+        if let Err(error) = stream.read_to_end(&mut rest) {
+            assert_eq!(error.kind(), io::ErrorKind::ConnectionReset, "{error}");
+        }
+    }
+    assert!(page.join().expect("no panic").contains("ambience_ready"));
+    server.kill().expect("running");
+    server.wait().expect("ended");
+}
+
 fn metrics(address: &str) -> String {
     let mut stream = TcpStream::connect(address).expect("connected");
     stream.write_all(b"GET /metrics HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n").expect("sent");

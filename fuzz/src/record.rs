@@ -41,9 +41,10 @@ pub fn record(data: &[u8]) {
         for record in sound.values().rev() {
             one_by_one.extend([*record]);
         }
-        let far = |record: &Irradiance| record.position.abs().max_element() + a * record.radius.max(record.radius_min);
+        let counts = |record: &Irradiance| a * record.radius.min(record.radius_max).max(record.radius_min);
+        let far = |record: &Irradiance| record.position.abs().max_element() + counts(record);
         let extent = sound.values().map(far).fold(0.0, f32::max);
-        for record in sound.values().filter(|record| a * record.radius > RESOLVED * extent) {
+        for record in sound.values().filter(|record| counts(record) > RESOLVED * extent) {
             let site = Query { position: record.position, normal: record.normal };
             assert!(at_once.covers(&site), "{record:?}");
             let beside = Query { position: record.position + Vec3::splat(record.radius * a * 0.3), ..site };
