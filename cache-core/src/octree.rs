@@ -15,8 +15,8 @@ const NONE: u32 = 0;
 /// Indices of balls, in cells.
 #[derive(Clone, Debug, Default)]
 pub struct Octree {
-    low: Vec3,
-    size: f32,
+    /// Half the size of the root, whose middle is the origin.
+    half: f32,
     cells: Vec<Cell>,
 }
 
@@ -32,30 +32,27 @@ impl Octree {
         // A reach below the spacing of floats round the centre could not tell one cell from the next.
         let reach = reach.max(center.abs().max_element() * 1e-6).max(1e-30);
         self.grow_to_hold(center, reach);
-        self.file(0, self.low, self.size, 0, index, center, reach);
+        self.file(0, Vec3::splat(-self.half), 2.0 * self.half, 0, index, center, reach);
     }
 
+    /// The root reaches as far on one side of the origin as on the other, a power of two: the borders of all cells are then
+    /// multiples of their sizes, which no sum rounds, and where a ball is found does not depend on the order of filing.
     fn grow_to_hold(&mut self, center: Vec3, reach: f32) {
-        let (low, high) = (center - reach, center + reach);
+        let farthest = center.abs().max_element() + reach;
         if self.cells.is_empty() {
             self.cells.push(Cell::default());
-            self.low = low;
-            self.size = 2.0 * reach;
+            self.half = power_of_two(farthest);
         }
-        while !(low.cmpge(self.low).all() && high.cmple(self.low + self.size).all()) {
-            // Double towards the side that is short; the old root becomes one child of the new.
-            let mut octant = 0;
-            for axis in 0..3 {
-                if low[axis] < self.low[axis] {
-                    self.low[axis] -= self.size;
-                    octant |= 1 << axis;
-                }
+        while self.half < farthest {
+            self.half *= 2.0;
+            // What was an eighth of the root is now an eighth of an eighth, its corner still at the origin.
+            let eighths = self.cells[0].children;
+            for (octant, inner) in eighths.into_iter().enumerate().filter(|(_, inner)| *inner != NONE) {
+                let mut outer = Cell::default();
+                outer.children[7 ^ octant] = inner;
+                self.cells[0].children[octant] = self.cells.len() as u32;
+                self.cells.push(outer);
             }
-            self.size *= 2.0;
-            let mut root = Cell::default();
-            root.children[octant] = self.cells.len() as u32;
-            let old = std::mem::replace(&mut self.cells[0], root);
-            self.cells.push(old);
         }
     }
 
@@ -85,11 +82,10 @@ impl Octree {
     /// Calls `visit` with every ball whose reach may hold `point`; stops when it returns false.
     #[inline]
     pub fn visit(&self, point: Vec3, mut visit: impl FnMut(u32) -> bool) {
-        let inside = point.cmpge(self.low).all() && point.cmple(self.low + self.size).all();
-        if self.cells.is_empty() || !inside {
+        if self.cells.is_empty() || !point.abs().cmple(Vec3::splat(self.half)).all() {
             return;
         }
-        let (mut cell, mut low, mut size) = (0, self.low, self.size);
+        let (mut cell, mut low, mut size) = (0, Vec3::splat(-self.half), 2.0 * self.half);
         loop {
             let here = &self.cells[cell];
             for &ball in &here.balls {
@@ -107,6 +103,12 @@ impl Octree {
             }
         }
     }
+}
+
+/// The least power of two that is at least `size`.
+fn power_of_two(size: f32) -> f32 {
+    const MANTISSA: u32 = (1 << 23) - 1;
+    f32::from_bits((size.to_bits() + MANTISSA) & !MANTISSA)
 }
 
 fn offset(octant: usize) -> Vec3 {
@@ -137,6 +139,34 @@ mod tests {
                     if Vec3::from(*c).distance(point) < *r {
                         prop_assert_eq!(seen[i], 1);
                     }
+                }
+            }
+        }
+    }
+
+    /// Balls far smaller than what lies between them: found in any order of filing.
+    #[test]
+    fn one_ball_far_away_hides_no_other() {
+        let near = |i: u32| (Vec3::new(0.37, 0.11, 0.73) * (1.0 + i as f32 * 0.01), 1e-5f32);
+        let far = (Vec3::new(-3e6, 2.1e6, 7.7e6), 30.0);
+        for first in [true, false] {
+            let mut tree = Octree::default();
+            if first {
+                tree.insert(99, far.0, far.1);
+            }
+            (0..50).for_each(|i| tree.insert(i, near(i).0, near(i).1));
+            if !first {
+                tree.insert(99, far.0, far.1);
+            }
+            for i in 0..50 {
+                let (center, reach) = near(i);
+                for at in [center, center + Vec3::X * reach * 0.9, center - Vec3::splat(reach * 0.5)] {
+                    let mut seen = false;
+                    tree.visit(at, |ball| {
+                        seen |= ball == i;
+                        true
+                    });
+                    assert!(seen, "ball {i}, the far one first: {first}");
                 }
             }
         }
