@@ -283,7 +283,12 @@ mod tests {
         assert_eq!(none, "scene.glb has no camera: name a view file with --camera FILE.vf");
 
         let check = |rest: &[&str]| usage(args(rest).check());
-        assert_eq!(check(&["--error", "0.1"]), "--error is not available yet");
+        let refused = |rest: &[&str]| {
+            let line = ["render", "scene.glb", "-o", "out.exr"].iter().chain(rest);
+            Line::try_parse_from(line).err().expect("refused").to_string()
+        };
+        assert!(refused(&["--error", "2"]).contains("expected a number from 0.001 to 0.5, as 0.02 for 2 %"));
+        assert!(refused(&["--error", "0.02", "--rays", "64"]).contains("cannot be used with"));
         assert_eq!(check(&["--cache", "Cargo.toml"]), "--cache Cargo.toml: expected a directory");
         assert!(check(&["--workers", "0"]).starts_with("--workers 0 needs --server"));
         assert!(check(&["--stats", "/no/such/folder/s.json"]).starts_with("--stats /no/such/folder/s.json: cannot"));

@@ -28,7 +28,8 @@ fn the_error_met_is_the_one_asked_for() {
             let line = format!("{scene}: asked {error}, met {met:.4}, believed {believed:.4}, {rays} rays");
             println!("{line}");
             let error = f64::from(error);
-            if !(error / 3.0..=1.2 * error).contains(&met) || !(0.5..2.0).contains(&(believed / met)) || rays <= before {
+            if !(error / 3.0..=1.2 * error).contains(&met) || !(0.5..2.0).contains(&(believed / met)) || rays <= before
+            {
                 wrong.push(line);
             }
             before = rays;

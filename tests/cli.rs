@@ -49,7 +49,7 @@ fn wrong_usage_is_one_line() {
     with(&["--rays", "1"], &["--rays"]);
     with(&["--method", "magic"], &["magic", "irradiance"]);
     with(&["--camera", "nobody"], &["nobody", "camera"]);
-    with(&["--error", "0.02"], &["--error", "not available yet"]);
+    with(&["--error", "0"], &["--error", "expected a number from 0.001 to 0.5"]);
     with(&["--cache", &cornell], &["--cache", "expected a directory"]);
     with(&["--server", "nonsense"], &["nonsense"]);
     with(&["--stats", &out], &["--stats", "out.exr", "another file"]);

