@@ -50,7 +50,7 @@ const RECORDS_AT_ONCE: f64 = 1.3;
 
 /// A gather traces at least an average one's rays divided by this.
 const LEAST: f64 = 4.0;
-const LEAST_RANGE: (u32, u32) = (32, 2048);
+const LEAST_RANGE: (u32, u32) = (16, 2048);
 
 /// Time a look into the cache takes, in rays.
 const RAYS_A_QUERY: f64 = 8.0;
