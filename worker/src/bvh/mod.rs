@@ -1,11 +1,11 @@
 //! Rays against triangles: a tree eight wide, and a watertight triangle test (Woop, Benthin and Wald 2013).
 //!
-//! - [`build`]: the tree, from a binary one by obvhs.
-//! - [`ray`]: a ray made ready.
-//! - [`traverse`]: which nodes a ray visits, and in which order.
-//! - [`portable`], [`avx2`]: eight boxes or triangles at once, in plain Rust and by AVX2: the same operations in the same
+//! - `build`: the tree, from a binary one by obvhs.
+//! - `ray`: a ray made ready.
+//! - `traverse`: which nodes a ray visits, and in which order.
+//! - `portable`, [`avx2`]: eight boxes or triangles at once, in plain Rust and by AVX2: the same operations in the same
 //!   order, so the same bits.
-//! - [`huge`]: memory in huge pages.
+//! - `huge`: memory in huge pages.
 //!
 //! Every worker builds the same tree from the same scene, and a ray asks nothing but the tree and the scene, so a hit has
 //! the same bits everywhere.
