@@ -3,7 +3,7 @@
 //! - `build`: the tree, from a binary one by obvhs.
 //! - `ray`: a ray made ready.
 //! - `traverse`: which nodes a ray visits, and in which order.
-//! - `portable`, [`avx2`]: eight boxes or triangles at once, in plain Rust and by AVX2: the same operations in the same
+//! - `portable`, `avx2`: eight boxes or triangles at once, in plain Rust and by AVX2: the same operations in the same
 //!   order, so the same bits.
 //! - `huge`: memory in huge pages.
 //!

@@ -1,5 +1,5 @@
 //! Where light comes from, and how shadow rays find it: one light per request, chosen by what it may give there
-//! ([`tree`]).
+//! (`tree`).
 //!
 //! Light is *sampled* (shadow rays look for it; rays that meet it by chance count only by multiple importance sampling)
 //! or *gathered* (only rays that meet it by chance count; a record of irradiance includes it). Which one makes no
