@@ -1,5 +1,5 @@
-//! The practical details of irradiance caching, each with the choices the literature knows. The defaults are those the
-//! charts favour (`ambience-bench details`); the others stay for measuring against.
+//! The practical details of irradiance caching, each with the choices the literature knows; `ambience-bench details` measures
+//! them against each other. Only the default metric is chosen by such a chart so far, the rest by the course notes.
 //!
 //! Sources: course notes of 2007, "Implementation details"; Tabellion, Lamorlette 2004; Krivanek et al. 2006; Jarosz et
 //! al. 2012; Schwarzhaupt, Jensen, Jarosz 2012.
