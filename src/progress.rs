@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use cache_core::rounds::RANKS;
+use cache_core::rounds;
 use cache_proto::v1;
 use indicatif::{HumanDuration, ProgressBar, ProgressStyle};
 
@@ -55,8 +55,8 @@ impl Progress {
         self.show(phase, phase.to_string(), None);
     }
 
-    /// Shows what the server said.
-    pub fn frame(&mut self, progress: &v1::FrameProgress) {
+    /// Shows what the server said of a picture of so many pixels.
+    pub fn frame(&mut self, progress: &v1::FrameProgress, pixels: u64) {
         let Some(step) = &progress.step else { return };
         let phase = phase_name(step);
         if progress.workers == 0 && !self.own {
@@ -66,7 +66,7 @@ impl Progress {
             0 => format!("pixels · {} records", progress.records),
             level => format!("level {level} pass {} · {} records", step.pass + 1, progress.records),
         };
-        self.show(&format!("{phase} {}", step.pass), shown, Some(share(progress)));
+        self.show(&format!("{phase} {}", step.pass), shown, Some(share(progress, pixels)));
     }
 
     /// Shows what others have to do first; as a line that stays where there is no bar.
@@ -135,14 +135,16 @@ pub fn phase_name(step: &v1::Step) -> String {
 }
 
 /// How much of its phase (a pass over a level, or the pixels) is done, 0 to 1.
-fn share(progress: &v1::FrameProgress) -> f64 {
+fn share(progress: &v1::FrameProgress, pixels: u64) -> f64 {
     let Some(step) = &progress.step else { return 0.0 };
     let tiles = f64::from(progress.tiles_done) / f64::from(progress.tiles_total.max(1));
     match step.level {
         0 => tiles,
         _ => {
-            let (from, to) = (f64::from(step.rank_from), f64::from(step.rank_to));
-            let tested = (from + (to - from) * tiles) / f64::from(RANKS);
+            let ranks = rounds::ranks(step.level, step.pass, pixels);
+            let tested = |rank: u32| f64::from(rank.saturating_sub(ranks.start)) / ranks.len() as f64;
+            let (from, to) = (tested(step.rank_from), tested(step.rank_to));
+            let tested = from + (to - from) * tiles;
             // At first almost every candidate becomes a record, later few: a count of candidates would promise far too long
             // a wait. Later passes gather little, evenly.
             if step.pass == 0 { tested.sqrt() } else { tested }
@@ -162,14 +164,17 @@ mod tests {
 
     #[test]
     fn the_share_counts_ranks_and_tiles() {
-        let step = v1::Step { level: 2, rank_from: RANKS / 2, rank_to: RANKS, ..Default::default() };
+        let step = v1::Step { level: 2, rank_from: rounds::RANKS / 2, rank_to: rounds::RANKS, ..Default::default() };
         let progress =
             v1::FrameProgress { step: Some(step.clone()), tiles_done: 1, tiles_total: 4, ..Default::default() };
-        assert_eq!(share(&progress), 0.625f64.sqrt());
+        assert_eq!(share(&progress, 1), 0.625f64.sqrt());
         let again = v1::Step { pass: 1, ..step };
-        assert_eq!(share(&v1::FrameProgress { step: Some(again), ..progress.clone() }), 0.625);
+        assert_eq!(share(&v1::FrameProgress { step: Some(again), ..progress.clone() }, 1), 0.625);
+        // A large picture looks at other ranks in each pass.
+        let large = v1::Step { level: 2, pass: 1, rank_from: 2048 + 64, rank_to: 2048 + 128, ..Default::default() };
+        assert_eq!(share(&v1::FrameProgress { step: Some(large), ..progress.clone() }, 512 * 512), 0.3125);
         let pixels = v1::FrameProgress { step: Some(v1::Step::default()), ..progress };
-        assert_eq!(share(&pixels), 0.25);
+        assert_eq!(share(&pixels, 1), 0.25);
     }
 
     #[test]

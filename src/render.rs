@@ -259,7 +259,7 @@ impl Render<'_> {
             match event {
                 Some(FrameEvent::Progress(progress)) => {
                     self.stats.phase(&progress.step.as_ref().map_or("start".into(), phase_name));
-                    self.progress.frame(&progress);
+                    self.progress.frame(&progress, job.settings.size());
                 }
                 Some(FrameEvent::Tile(tile)) => {
                     self.stats.tile_bytes += tile.pixels.len() as u64;

@@ -280,7 +280,7 @@ impl Irradiance {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::details::Weighting;
 

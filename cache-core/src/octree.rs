@@ -1,118 +1,219 @@
-//! Files balls by size and place; says which may hold a point.
+//! Files balls in the order of an octree's cells; says which may hold a point.
 //!
-//! A ball is filed at the level whose cells are 2 to 4 times its reach, in each of the at most 8 cells it touches, so
-//! that a question walks one path from the root and sees every ball once (after Ward 1988, 3.3, with the search moved
-//! to insertion).
+//! Balls stand in Morton order of their centres, the order in which an octree without end is walked, eight to a block; eight
+//! blocks make a cell, eight cells a larger one. What belongs together follows from the place in the row, so that no pointers
+//! are kept, and each cell knows the boxes of what its eight parts reach: a question tests eight at once.
 
-use glam::Vec3;
+use std::cmp::Ordering;
 
-/// Deepest level below the root; smaller balls are filed there too.
-const DEPTH_MAX: u32 = 40;
+use glam::{Vec3, Vec4};
 
-/// No cell.
-const NONE: u32 = 0;
+/// Parts of a cell, balls of a block: two vectors of four lanes.
+const WIDTH: usize = 8;
 
-/// Indices of balls, in cells.
+/// Levels of cells over `u32::MAX` balls.
+const LEVELS_MAX: usize = 10;
+
+/// A ball is filed so much wider, relative to its reach and to its distance from the origin, that no rounding loses it.
+const SLACK: [f32; 2] = [1.0 + 1e-5, 3e-7];
+
+/// Squares of shorter lengths lose digits.
+const REACH_LEAST: f32 = 1e-17;
+
+/// Eight numbers, one for each part.
+type Eight = [Vec4; 2];
+
+/// Balls, each known by its place in Morton order.
 #[derive(Clone, Debug, Default)]
 pub struct Octree {
-    /// Half the size of the root, whose middle is the origin.
-    half: f32,
-    cells: Vec<Cell>,
+    blocks: Vec<Block>,
+    /// Cells over blocks, cells over those, and so on up to one root.
+    levels: Vec<Vec<Cell>>,
 }
 
-#[derive(Clone, Debug, Default)]
+/// Eight balls: centres and squared reaches.
+#[derive(Clone, Copy, Debug)]
+#[repr(align(64))]
+struct Block {
+    center: [Eight; 3],
+    square: Eight,
+}
+
+/// The boxes of eight parts.
+#[derive(Clone, Copy, Debug)]
+#[repr(align(64))]
 struct Cell {
-    children: [u32; 8],
-    balls: Vec<u32>,
+    low: [Eight; 3],
+    high: [Eight; 3],
 }
 
 impl Octree {
-    /// Files ball `index` with `center` and `reach` (world lengths, both at most 1e18).
-    pub fn insert(&mut self, index: u32, center: Vec3, reach: f32) {
-        // A reach below the spacing of floats round the centre could not tell one cell from the next.
-        let reach = reach.max(center.abs().max_element() * 1e-6).max(1e-30);
-        self.grow_to_hold(center, reach);
-        self.file(0, Vec3::splat(-self.half), 2.0 * self.half, 0, index, center, reach);
+    /// Files balls (center, reach; world lengths, both at most 1e19) that stand in [`order`].
+    pub fn new(balls: impl ExactSizeIterator<Item = (Vec3, f32)>) -> Self {
+        let count = balls.len().div_ceil(WIDTH);
+        let mut blocks = vec![Block::EMPTY; count];
+        let mut boxes = vec![Aabb::EMPTY; count];
+        for (i, (center, reach)) in balls.enumerate() {
+            let reach = reach.max(REACH_LEAST) * SLACK[0];
+            blocks[i / WIDTH].set(i % WIDTH, center, reach);
+            let aside = Vec3::splat(reach) + center.abs() * SLACK[1];
+            boxes[i / WIDTH].unite(Aabb { low: center - aside, high: center + aside });
+        }
+        let mut levels = Vec::new();
+        while boxes.len() > 1 {
+            let mut cells = vec![Cell::EMPTY; boxes.len().div_ceil(WIDTH)];
+            let mut outer = vec![Aabb::EMPTY; cells.len()];
+            for (i, inner) in boxes.iter().enumerate() {
+                cells[i / WIDTH].set(i % WIDTH, *inner);
+                outer[i / WIDTH].unite(*inner);
+            }
+            levels.push(cells);
+            boxes = outer;
+        }
+        Self { blocks, levels }
     }
 
-    /// The root reaches as far on one side of the origin as on the other, a power of two: the borders of all cells are then
-    /// multiples of their sizes, which no sum rounds, and where a ball is found does not depend on the order of filing.
-    fn grow_to_hold(&mut self, center: Vec3, reach: f32) {
-        let farthest = center.abs().max_element() + reach;
-        if self.cells.is_empty() {
-            self.cells.push(Cell::default());
-            self.half = power_of_two(farthest);
-        }
-        while self.half < farthest {
-            self.half *= 2.0;
-            // What was an eighth of the root is now an eighth of an eighth, its corner still at the origin.
-            let eighths = self.cells[0].children;
-            for (octant, inner) in eighths.into_iter().enumerate().filter(|(_, inner)| *inner != NONE) {
-                let mut outer = Cell::default();
-                outer.children[7 ^ octant] = inner;
-                self.cells[0].children[octant] = self.cells.len() as u32;
-                self.cells.push(outer);
-            }
-        }
-    }
-
-    #[allow(clippy::too_many_arguments)]
-    fn file(&mut self, cell: usize, low: Vec3, size: f32, depth: u32, index: u32, center: Vec3, reach: f32) {
-        if size < 4.0 * reach || depth == DEPTH_MAX {
-            self.cells[cell].balls.push(index);
-            return;
-        }
-        let half = size * 0.5;
-        for octant in 0..8 {
-            let corner = low + half * offset(octant);
-            let gap = (corner - center).max(center - (corner + half)).max_element();
-            if gap > reach {
-                continue;
-            }
-            let mut child = self.cells[cell].children[octant];
-            if child == NONE {
-                child = self.cells.len() as u32;
-                self.cells.push(Cell::default());
-                self.cells[cell].children[octant] = child;
-            }
-            self.file(child as usize, corner, half, depth + 1, index, center, reach);
-        }
-    }
-
-    /// Calls `visit` with every ball whose reach may hold `point`; stops when it returns false.
+    /// Calls `visit` with the place of every ball that may hold `point`, in order; stops when it returns false.
     #[inline]
-    pub fn visit(&self, point: Vec3, mut visit: impl FnMut(u32) -> bool) {
-        if self.cells.is_empty() || !point.abs().cmple(Vec3::splat(self.half)).all() {
+    pub fn visit(&self, point: Vec3, mut visit: impl FnMut(usize) -> bool) {
+        let point = [Vec4::splat(point.x), Vec4::splat(point.y), Vec4::splat(point.z)];
+        let mut in_block = |at: usize| {
+            let mut hit = self.blocks[at].holding(point);
+            while hit != 0 {
+                if !visit(at * WIDTH + hit.trailing_zeros() as usize) {
+                    return false;
+                }
+                hit &= hit - 1;
+            }
+            true
+        };
+        // Of each level, the cell at work and its parts still to be seen.
+        let mut open = [(0, 0); LEVELS_MAX];
+        let Some(top) = self.levels.len().checked_sub(1) else {
+            if !self.blocks.is_empty() {
+                in_block(0);
+            }
             return;
-        }
-        let (mut cell, mut low, mut size) = (0, Vec3::splat(-self.half), 2.0 * self.half);
+        };
+        open[top] = (0, self.levels[top][0].holding(point));
+        let mut level = top;
         loop {
-            let here = &self.cells[cell];
-            for &ball in &here.balls {
-                if !visit(ball) {
+            let (cell, parts) = open[level];
+            if parts == 0 {
+                if level == top {
                     return;
                 }
+                level += 1;
+                continue;
             }
-            size *= 0.5;
-            let upper = point.cmpge(low + size);
-            let octant = upper.bitmask() as usize;
-            low += size * offset(octant);
-            match here.children[octant] {
-                NONE => return,
-                child => cell = child as usize,
+            open[level].1 = parts & (parts - 1);
+            let part = cell * WIDTH + parts.trailing_zeros() as usize;
+            if level > 0 {
+                level -= 1;
+                open[level] = (part, self.levels[level][part].holding(point));
+            } else if !in_block(part) {
+                return;
             }
         }
     }
+
+    /// Bytes it takes.
+    pub fn bytes(&self) -> usize {
+        let cells: usize = self.levels.iter().map(Vec::len).sum();
+        self.blocks.len() * size_of::<Block>() + cells * size_of::<Cell>()
+    }
 }
 
-/// The least power of two that is at least `size`.
-fn power_of_two(size: f32) -> f32 {
+impl Block {
+    /// Holds nothing: no square is below 0.
+    const EMPTY: Self = Self { center: [[Vec4::ZERO; 2]; 3], square: [Vec4::NEG_ONE; 2] };
+
+    fn set(&mut self, lane: usize, center: Vec3, reach: f32) {
+        for axis in 0..3 {
+            self.center[axis][lane / 4][lane % 4] = center[axis];
+        }
+        self.square[lane / 4][lane % 4] = reach * reach;
+    }
+
+    /// Which balls hold the point, a bit each.
+    #[inline]
+    fn holding(&self, [x, y, z]: [Vec4; 3]) -> u32 {
+        let half = |i: usize| {
+            let (x, y, z) = (x - self.center[0][i], y - self.center[1][i], z - self.center[2][i]);
+            (x * x + y * y + z * z).cmple(self.square[i]).bitmask()
+        };
+        half(0) | half(1) << 4
+    }
+}
+
+impl Cell {
+    /// Holds nothing.
+    const EMPTY: Self = Self { low: [[Vec4::INFINITY; 2]; 3], high: [[Vec4::NEG_INFINITY; 2]; 3] };
+
+    fn set(&mut self, lane: usize, part: Aabb) {
+        for axis in 0..3 {
+            self.low[axis][lane / 4][lane % 4] = part.low[axis];
+            self.high[axis][lane / 4][lane % 4] = part.high[axis];
+        }
+    }
+
+    /// Which parts' boxes hold the point, a bit each.
+    #[inline]
+    fn holding(&self, [x, y, z]: [Vec4; 3]) -> u32 {
+        let half = |i: usize| {
+            let within = |p: Vec4, axis: usize| p.cmpge(self.low[axis][i]) & p.cmple(self.high[axis][i]);
+            (within(x, 0) & within(y, 1) & within(z, 2)).bitmask()
+        };
+        half(0) | half(1) << 4
+    }
+}
+
+#[derive(Clone, Copy)]
+struct Aabb {
+    low: Vec3,
+    high: Vec3,
+}
+
+impl Aabb {
+    const EMPTY: Self = Self { low: Vec3::INFINITY, high: Vec3::NEG_INFINITY };
+
+    fn unite(&mut self, other: Self) {
+        (self.low, self.high) = (self.low.min(other.low), self.high.max(other.high));
+    }
+}
+
+/// Morton order of finite points: that of the bits of their coordinates taken in turn, however many there are (after Connor and
+/// Kumar 2010). A total order of places; `Equal` only for the same place.
+pub fn order(a: Vec3, b: Vec3) -> Ordering {
+    // Of two zeros neither is the lesser.
+    let (a, b) = (a + Vec3::ZERO, b + Vec3::ZERO);
+    let (mut axis, mut highest) = (2, highest_difference(a.z, b.z));
+    for i in [1, 0] {
+        let here = highest_difference(a[i], b[i]);
+        if here > highest {
+            (axis, highest) = (i, here);
+        }
+    }
+    a[axis].total_cmp(&b[axis])
+}
+
+/// Place of the highest bit in which two numbers differ.
+fn highest_difference(a: f32, b: f32) -> i32 {
     const MANTISSA: u32 = (1 << 23) - 1;
-    f32::from_bits((size.to_bits() + MANTISSA) & !MANTISSA)
-}
-
-fn offset(octant: usize) -> Vec3 {
-    Vec3::new((octant & 1) as f32, (octant >> 1 & 1) as f32, (octant >> 2) as f32)
+    let parts = |v: f32| {
+        let (exponent, mantissa) = (v.to_bits() >> 23 & 0xff, v.to_bits() & MANTISSA);
+        // Below the least exponent there is no leading 1.
+        if exponent == 0 { (1, mantissa) } else { (exponent as i32, mantissa | 1 << 23) }
+    };
+    if a.is_sign_negative() != b.is_sign_negative() {
+        return i32::MAX;
+    }
+    let ((e, m), (f, n)) = (parts(a), parts(b));
+    match m ^ n {
+        _ if e != f => e.max(f),
+        0 => i32::MIN,
+        differ => e - differ.leading_zeros() as i32 + 8,
+    }
 }
 
 #[cfg(test)]
@@ -121,64 +222,77 @@ mod tests {
 
     use super::*;
 
+    fn tree(balls: &mut [(Vec3, f32)]) -> Octree {
+        balls.sort_by(|a, b| order(a.0, b.0));
+        Octree::new(balls.iter().copied())
+    }
+
     proptest! {
         #[test]
-        fn finds_every_ball_that_holds_the_point_and_each_once(
-            balls in prop::collection::vec((prop::array::uniform3(-9f32..9.0), 1e-4f32..5.0), 1..120),
-            points in prop::collection::vec(prop::array::uniform3(-12f32..12.0), 1..60),
+        fn finds_every_ball_that_holds_the_point_once_and_in_order(
+            balls in prop::collection::vec((prop::array::uniform3(-9f32..9.0), 1e-4f32..5.0), 0..700),
+            points in prop::collection::vec(prop::array::uniform3(-12f32..12.0), 1..20),
         ) {
-            let mut tree = Octree::default();
-            for (i, (c, r)) in balls.iter().enumerate() {
-                tree.insert(i as u32, Vec3::from(*c), *r);
-            }
+            let mut balls: Vec<_> = balls.into_iter().map(|(c, r)| (Vec3::from(c), r)).collect();
+            let tree = tree(&mut balls);
             for point in points.into_iter().map(Vec3::from) {
-                let mut seen = vec![0; balls.len()];
-                tree.visit(point, |i| { seen[i as usize] += 1; true });
+                let mut seen = vec![];
+                tree.visit(point, |i| { seen.push(i); true });
+                prop_assert!(seen.is_sorted_by(|a, b| a < b));
                 for (i, (c, r)) in balls.iter().enumerate() {
-                    prop_assert!(seen[i] <= 1);
-                    if Vec3::from(*c).distance(point) < *r {
-                        prop_assert_eq!(seen[i], 1);
-                    }
+                    let distance = c.distance(point);
+                    let found = seen.binary_search(&i).is_ok();
+                    prop_assert!(found || distance >= *r);
+                    prop_assert!(!found || distance <= *r * 1.001 + 1e-5, "a ball that is far away");
                 }
             }
         }
-    }
 
-    /// Balls far smaller than what lies between them: found in any order of filing.
-    #[test]
-    fn one_ball_far_away_hides_no_other() {
-        let near = |i: u32| (Vec3::new(0.37, 0.11, 0.73) * (1.0 + i as f32 * 0.01), 1e-5f32);
-        let far = (Vec3::new(-3e6, 2.1e6, 7.7e6), 30.0);
-        for first in [true, false] {
-            let mut tree = Octree::default();
-            if first {
-                tree.insert(99, far.0, far.1);
-            }
-            (0..50).for_each(|i| tree.insert(i, near(i).0, near(i).1));
-            if !first {
-                tree.insert(99, far.0, far.1);
-            }
-            for i in 0..50 {
-                let (center, reach) = near(i);
-                for at in [center, center + Vec3::X * reach * 0.9, center - Vec3::splat(reach * 0.5)] {
-                    let mut seen = false;
-                    tree.visit(at, |ball| {
-                        seen |= ball == i;
-                        true
-                    });
-                    assert!(seen, "ball {i}, the far one first: {first}");
-                }
-            }
+        /// The order is that of integers' bits taken in turn where coordinates are integers.
+        #[test]
+        fn order_is_that_of_interleaved_bits(a in prop::array::uniform3(0u32..1 << 20), b in prop::array::uniform3(0u32..1 << 20)) {
+            let key = |p: [u32; 3]| {
+                (0..60).fold(0u64, |key, bit| key | u64::from(p[bit % 3] >> (bit / 3) & 1) << bit)
+            };
+            let point = |p: [u32; 3]| Vec3::from(p.map(|v| v as f32));
+            prop_assert_eq!(order(point(a), point(b)), key(a).cmp(&key(b)));
+        }
+
+        #[test]
+        fn order_is_total(bits in prop::array::uniform9(any::<u32>())) {
+            let v = bits.map(|b| Some(f32::from_bits(b)).filter(|v| v.is_finite()).unwrap_or(0.0));
+            let [a, b, c] = [0, 3, 6].map(|i| Vec3::from_slice(&v[i..]));
+            prop_assert_eq!(order(a, b), order(b, a).reverse());
+            prop_assert!(order(a, b).is_gt() || order(b, c).is_gt() || order(a, c).is_le());
+            prop_assert_eq!(order(a, a), Ordering::Equal);
         }
     }
 
     #[test]
-    fn extreme_balls_are_filed_without_end_or_panic() {
-        let mut tree = Octree::default();
-        for (i, (c, r)) in [(0.0, 1e-38), (1e18, 1e-38), (-1e18, 1.0), (1e18, 1e18), (0.5, 1e18)].iter().enumerate() {
-            tree.insert(i as u32, Vec3::splat(*c), *r);
+    fn zeros_and_the_least_numbers_have_their_places() {
+        let x = |x: f32| Vec3::new(x, 0.0, 0.0);
+        let row = [-1.0, -1e-40, 0.0, 1e-45, 1e-40, 2e-38, 1.0];
+        assert!(row.is_sorted_by(|a, b| order(x(*a), x(*b)).is_lt()));
+        assert_eq!(order(x(0.0), x(-0.0)), Ordering::Equal);
+    }
+
+    /// Balls far smaller than what lies between them, and others that span all.
+    #[test]
+    fn extreme_balls_hide_no_other() {
+        let near = (0..50).map(|i| (Vec3::new(0.37, 0.11, 0.73) * (1.0 + i as f32 * 0.01), 1e-5f32));
+        let far = [(-3e6, 30.0), (1e18, 1e-38), (-1e18, 1.0), (1e18, 1e18), (0.5, 1e18), (0.0, 1e-38)];
+        let mut balls: Vec<_> = near.chain(far.map(|(c, r)| (Vec3::splat(c), r))).collect();
+        let tree = tree(&mut balls);
+        for (i, (center, reach)) in balls.iter().enumerate() {
+            for at in [*center, *center + Vec3::X * *reach * 0.9, *center - Vec3::splat(*reach * 0.5)] {
+                let mut seen = false;
+                tree.visit(at, |ball| {
+                    seen |= ball == i;
+                    true
+                });
+                assert!(seen, "ball {i} of {reach} round {center} at {at}");
+            }
         }
-        tree.visit(Vec3::splat(0.5), |_| true);
-        tree.visit(Vec3::splat(f32::NAN), |_| true);
+        tree.visit(Vec3::splat(f32::NAN), |_| panic!("nowhere"));
     }
 }

@@ -24,15 +24,22 @@ const LOOKS: u32 = 4;
 /// The same for a deeper level: a gather ray that meets a hole goes on as a path.
 const LOOKS_DEEPER: u32 = 2;
 
+/// Candidates of a pass over level 1, at most about: a larger picture shows the same light with more pixels, and all looks
+/// together still leave none of them between points much nearer each other than records can be.
+const CANDIDATES: u64 = 1 << 16;
+
+/// The same for a deeper level, whose holes cost a path each.
+const CANDIDATES_DEEPER: u64 = 1 << 14;
+
 /// Rounds of a pass that looks where no pass has looked before, after the first.
 const ROUNDS_LATER: u32 = 8;
 
 /// Rounds of a pass that looks again: it only finds what clamping has uncovered since.
 const ROUNDS_AGAIN: u32 = 2;
 
-/// Ranks of the first round of a pass that refines; each round goes twice as far as the one before it. What shrank left
-/// holes of many pixels.
-const REFINING_FROM: u32 = RANKS / 64;
+/// The first round of a pass that refines, as a fraction of the pass; each round goes twice as far as the one before it. What
+/// shrank left holes of many pixels.
+const REFINING_FROM: u32 = 64;
 
 /// Most passes that refine; Krivanek 2006 needed at most 11.
 pub const REFINING_MAX: u32 = 11;
@@ -77,32 +84,49 @@ fn looks(level: u32) -> u32 {
     if level == 1 { LOOKS } else { LOOKS_DEEPER }
 }
 
+/// Ranks whose pixels a pass looks at in a picture of so many: all, or few enough for [`CANDIDATES`], then others in each look.
+pub fn ranks(level: u32, pass: u32, pixels: u64) -> Range<u32> {
+    let candidates = if level == 1 { CANDIDATES } else { CANDIDATES_DEEPER };
+    let count = (u64::from(RANKS) * candidates / pixels.max(1)).clamp(1, RANKS.into()) as u32;
+    let share = RANKS / looks(level);
+    let from = if count <= share { look(level, pass) * share } else { 0 };
+    from..from + count
+}
+
 /// Gives a frame's steps one after another: levels deepest first, each in passes until every look in turn gathers
 /// nothing, then the pixels.
 #[derive(Clone, Debug)]
 pub struct Plan {
     adaptive: bool,
+    pixels: u64,
     level: u32,
     pass: u32,
     /// Passes in a row that gathered nothing.
     quiet: u32,
     from: u32,
     gathered: u64,
+    /// Passes over level 1 so far.
+    passes: u32,
     done: bool,
 }
 
 impl Plan {
-    /// A plan for `levels` levels of records (0: pixels only); an adaptive one has passes that refine.
-    pub fn new(levels: u32, adaptive: bool) -> Self {
-        Self { adaptive, level: levels, pass: 0, quiet: 0, from: 0, gathered: 0, done: false }
+    /// A plan for `levels` levels of records (0: pixels only) of a picture of so many pixels; an adaptive one has passes that
+    /// refine.
+    pub fn new(levels: u32, adaptive: bool, pixels: u64) -> Self {
+        Self { adaptive, pixels, level: levels, pass: 0, quiet: 0, from: 0, gathered: 0, passes: 0, done: false }
+    }
+
+    /// Passes over level 1 so far.
+    pub fn passes(&self) -> u32 {
+        self.passes
     }
 
     /// The next step, told how many records and proposals the previous one made (0 before the first); `None` when all is
     /// done.
     pub fn next(&mut self, gathered: u64) -> Option<Step> {
         self.gathered += gathered;
-        if self.level > 0 && self.from == RANKS {
-            self.from = 0;
+        if self.level > 0 && self.from == ranks(self.level, self.pass, self.pixels).end {
             self.pass += 1;
             let unrefined = self.adaptive && self.level == 1 && self.pass <= LOOKS;
             self.quiet = if self.gathered == 0 && !unrefined { self.quiet + 1 } else { 0 };
@@ -111,8 +135,12 @@ impl Plan {
                 self.level -= 1;
             }
             self.gathered = 0;
+            self.from = ranks(self.level, self.pass, self.pixels).start;
         }
         if self.level > 0 {
+            if self.level == 1 {
+                self.passes = self.pass + 1;
+            }
             let from = self.from;
             self.from = self.round_end();
             return Some(Step::Fill { level: self.level, pass: self.pass, ranks: from..self.from });
@@ -127,13 +155,15 @@ impl Plan {
 
     fn round_end(&self) -> u32 {
         let refining = self.adaptive && self.level == 1;
-        let end = match self.pass {
-            0 => ((self.from as f32 * GROWTH) as u32).max(self.from + 1),
-            pass if pass < looks(self.level) => self.from + RANKS / ROUNDS_LATER,
-            _ if refining => (2 * self.from).max(REFINING_FROM),
-            _ => self.from + RANKS / ROUNDS_AGAIN,
+        let Range { start, end } = ranks(self.level, self.pass, self.pixels);
+        let (done, all) = (self.from - start, end - start);
+        let done = match self.pass {
+            0 => ((done as f32 * GROWTH) as u32).max(done + 1),
+            pass if pass < looks(self.level) => done + all.div_ceil(ROUNDS_LATER),
+            _ if refining => (2 * done).max(all.div_ceil(REFINING_FROM)),
+            _ => done + all.div_ceil(ROUNDS_AGAIN),
         };
-        end.min(RANKS)
+        start + done.min(all)
     }
 }
 
@@ -158,7 +188,7 @@ mod tests {
     }
 
     fn steps(levels: u32, gathered: impl FnMut(&Step) -> u64) -> Vec<Step> {
-        all_steps(Plan::new(levels, false), gathered)
+        all_steps(Plan::new(levels, false, 1), gathered)
     }
 
     fn all_steps(mut plan: Plan, mut gathered: impl FnMut(&Step) -> u64) -> Vec<Step> {
@@ -197,6 +227,26 @@ mod tests {
         assert_eq!(all[..all.len() - 1], expected);
     }
 
+    /// At 512 x 512 all looks of level 1 together test every pixel once; small pictures are tested whole by each.
+    #[test]
+    fn a_large_picture_is_tested_by_other_pixels_in_each_look() {
+        let tested = |level, pixels| (0..looks(level)).map(move |pass| ranks(level, pass, pixels)).collect::<Vec<_>>();
+        assert_eq!(tested(1, 128 * 128), vec![0..RANKS; LOOKS as usize]);
+        assert_eq!(tested(1, 512 * 512), [0..1024, 1024..2048, 2048..3072, 3072..4096]);
+        assert_eq!(tested(2, 512 * 512), [0..256, 2048..2304]);
+        assert_eq!(tested(1, 65536 * 65536)[1..3], [1024..1025, 2048..2049]);
+        for pixels in [1, 300 * 300, 1000 * 1000, 65536 * 65536] {
+            let mut plan = Plan::new(2, false, pixels);
+            let mut at = 0;
+            while let Some(Step::Fill { level, pass, ranks: round }) = plan.next(0) {
+                let all = ranks(level, pass, pixels);
+                assert!(!round.is_empty() && (round.start == all.start || round.start == at), "{round:?} of {all:?}");
+                at = round.end;
+                assert!(at <= all.end);
+            }
+        }
+    }
+
     #[test]
     fn a_level_ends_when_every_look_gathers_nothing_or_gives_up() {
         assert_eq!(steps(0, |_| 0), [Step::Pixels]);
@@ -215,7 +265,7 @@ mod tests {
     #[test]
     fn an_adaptive_plan_refines_level_1_until_every_look_is_quiet() {
         let passes = |level: u32, found: &dyn Fn(&Step) -> u64| {
-            let all = all_steps(Plan::new(2, true), found);
+            let all = all_steps(Plan::new(2, true, 1), found);
             let pass = |step: &Step| match step {
                 Step::Fill { level: l, pass, ranks } if *l == level && ranks.start == 0 => Some(*pass),
                 _ => None,

@@ -3,6 +3,8 @@
 //! Everything here is derived from the records and `a` alone: two replicas with the same set answer with the same bits,
 //! whatever order the records came in. Asking never writes.
 
+use std::cmp::Ordering;
+
 use hashbrown::HashMap;
 use smallvec::SmallVec;
 
@@ -10,7 +12,7 @@ use crate::cached::{Cached, Query};
 use crate::clamp::Clamp;
 use crate::details::Details;
 use crate::id::{Digest, RecordId};
-use crate::octree::Octree;
+use crate::octree::{self, Octree};
 use crate::record::Record;
 use crate::shrink::Shrink;
 
@@ -22,7 +24,9 @@ const FIRST_OVER_NEAREST: f32 = 1.4;
 pub struct Sealed<C> {
     a: f32,
     details: Details,
+    /// In Morton order of their sites, those of one site by id: the order of sums.
     records: Vec<C>,
+    /// Of each record.
     derived: Vec<Derived>,
     /// Least allowed error proposed for each record, those that are not here (yet) included.
     proposed: HashMap<RecordId, f32>,
@@ -35,10 +39,6 @@ pub struct Sealed<C> {
 struct Derived {
     /// R*: raw R clamped by the neighbours' raw R.
     clamped: f32,
-    /// R the record counts with: R* within the record's bounds.
-    radius: f32,
-    /// How much of the gradients holds out to `radius`: R* / R where the lower bound stretched it, else 1.
-    limit: f32,
     /// a_i: the least of the global a and what was proposed.
     a: f32,
 }
@@ -73,30 +73,59 @@ impl<C: Cached> Sealed<C> {
     /// Opens the set, adds records that are not in it yet, and seals it again. The result depends on the united set
     /// only: extending in one step, in many, or in another order gives the same answers.
     pub fn extend(&mut self, new: impl IntoIterator<Item = C>) {
-        let known = self.records.len();
-        self.records.extend(new);
-        if self.records.len() == known {
+        let mut new: Vec<C> = new.into_iter().collect();
+        if new.is_empty() {
             return;
         }
-        let clamps = |records: &[C]| {
-            let records = if self.details.neighbor_clamping { records } else { &[] };
-            Clamp::new(records.iter().map(|r| (r.position(), r.radius())).collect())
-        };
-        let (all, fresh) = (clamps(&self.records), clamps(&self.records[known..]));
-        for i in 0..known {
-            let clamped = fresh.clamp(self.records[i].position(), self.derived[i].clamped);
-            if clamped < self.derived[i].clamped {
-                self.derived[i] = self.derive(&self.records[i], clamped);
+        new.sort_unstable_by(order);
+        new.iter().for_each(|record| self.digest.add(record.id()));
+        let fresh = self.clamp(&new);
+        for (record, derived) in self.records.iter().zip(&mut self.derived) {
+            derived.clamped = fresh.clamp(record.position(), derived.clamped);
+        }
+        let count = self.records.len() + new.len();
+        let (mut records, mut derived) = (Vec::with_capacity(count), Vec::with_capacity(count));
+        let mut new = new.into_iter().peekable();
+        // R* of what is new is found when all are in their places; one that is infinite indeed is found again.
+        let unknown = Derived { clamped: f32::INFINITY, a: self.a };
+        for (old, known) in self.records.drain(..).zip(self.derived.drain(..)) {
+            while let Some(record) = new.next_if(|record| order(record, &old).is_lt()) {
+                records.push(record);
+                derived.push(unknown);
+            }
+            records.push(old);
+            derived.push(known);
+        }
+        derived.resize(count, unknown);
+        records.extend(new);
+        (self.records, self.derived) = (records, derived);
+        let all = self.clamp(&self.records);
+        for (record, derived) in self.records.iter().zip(&mut self.derived) {
+            if derived.clamped == f32::INFINITY {
+                derived.clamped = all.clamp(record.position(), record.radius());
             }
         }
-        for (i, record) in self.records.iter().enumerate().skip(known) {
-            let (min, max) = record.radius_bounds();
-            // Filed by the greatest reach the record can ever have, so that neither clamping nor shrinking moves it.
-            self.octree.insert(i as u32, record.position(), self.a * record.radius().min(max).max(min));
-            let clamped = all.clamp(record.position(), record.radius());
-            self.derived.push(self.derive(record, clamped));
-            self.digest.add(record.id());
+        self.file();
+    }
+
+    /// What clamps these records' neighbours.
+    fn clamp(&self, records: &[C]) -> Clamp {
+        let records = if self.details.neighbor_clamping { records } else { &[] };
+        Clamp::new(records.iter().map(|r| (r.position(), r.radius())).collect())
+    }
+
+    /// Files every record by its reach of now.
+    fn file(&mut self) {
+        for (record, derived) in self.records.iter().zip(&mut self.derived) {
+            let radius = derived.radius(record);
+            let proposed = if self.proposed.is_empty() { None } else { self.proposed.get(&record.id()) };
+            // Whatever was proposed, the record counts out to the least reach.
+            let least = self.a * record.radius_bounds().0 / radius;
+            derived.a = proposed.map_or(self.a, |proposed| proposed.max(least).min(self.a));
         }
+        // By the global a, so that what shrank is still found as a neighbour; it is tested by its own.
+        let reach = |(record, derived): (&C, &Derived)| (record.position(), self.a * derived.radius(record));
+        self.octree = Octree::new(self.records.iter().zip(&self.derived).map(reach));
     }
 
     /// Opens the set, adds proposals that are not in it yet, of records that may come later, and seals it again. Neither their
@@ -111,9 +140,7 @@ impl<C: Cached> Sealed<C> {
             }
         }
         if lower {
-            for i in 0..self.records.len() {
-                self.derived[i] = self.derive(&self.records[i], self.derived[i].clamped);
-            }
+            self.file();
         }
     }
 
@@ -133,68 +160,59 @@ impl<C: Cached> Sealed<C> {
         self.shrink(shrinks);
     }
 
-    fn derive(&self, record: &C, clamped: f32) -> Derived {
-        let (min, max) = record.radius_bounds();
-        let radius = clamped.min(max).max(min);
-        let limit = if self.details.gradient_by_radius { (clamped / radius).min(1.0) } else { 1.0 };
-        let proposed = if self.proposed.is_empty() { None } else { self.proposed.get(&record.id()) };
-        // Whatever was proposed, the record counts out to the least reach.
-        let a = proposed.map_or(self.a, |proposed| proposed.max(self.a * min / radius).min(self.a));
-        Derived { clamped, radius, limit, a }
-    }
-
     /// Relative error and weight of a record at a query.
     #[inline]
     fn weigh(&self, i: usize, query: &Query) -> (f32, f32) {
-        let Derived { radius, a, .. } = self.derived[i];
-        let error = self.records[i].error(query, radius, a);
-        (error, self.details.weighting.weight(error, a))
+        let (record, derived) = (&self.records[i], &self.derived[i]);
+        let error = record.error(query, derived.radius(record), derived.a);
+        (error, self.details.weighting.weight(error, derived.a))
+    }
+
+    /// How much of the gradients holds out to the R a record counts with: R* / R where its lower bound stretched it, else 1.
+    #[inline]
+    fn limit(&self, i: usize) -> f32 {
+        let derived = &self.derived[i];
+        let limited = self.details.gradient_by_radius;
+        if limited { (derived.clamped / derived.radius(&self.records[i])).min(1.0) } else { 1.0 }
     }
 
     /// Whether any record counts at `query`.
     pub fn covers(&self, query: &Query) -> bool {
         let mut found = false;
         self.octree.visit(query.position, |i| {
-            found = self.weigh(i as usize, query).1 > 0.0;
+            found = self.weigh(i, query).1 > 0.0;
             !found
         });
         found
     }
 
-    /// The weighted mean of all records that count at `query`, summed in id order; `None` where there is none.
+    /// The weighted mean of all records that count at `query`, summed in Morton order; `None` where there is none.
     pub fn ask(&self, query: &Query) -> Option<C::Answer> {
-        let mut near: SmallVec<[(RecordId, u32, f32); 32]> = SmallVec::new();
+        let (mut answer, mut weights) = (C::Answer::default(), 0.0);
         self.octree.visit(query.position, |i| {
-            let record = &self.records[i as usize];
-            let (_, weight) = self.weigh(i as usize, query);
+            let (_, weight) = self.weigh(i, query);
             if weight > 0.0 {
-                near.push((record.id(), i, weight));
+                self.records[i].add(query, weight, self.limit(i), &mut answer);
+                weights += weight;
             }
             true
         });
-        if near.is_empty() {
-            return None;
-        }
-        near.sort_unstable_by_key(|n| n.0);
-        let (mut answer, mut weights) = (C::Answer::default(), 0.0);
-        for &(_, i, weight) in &near {
-            self.records[i as usize].add(query, weight, self.derived[i as usize].limit, &mut answer);
-            weights += weight;
-        }
-        C::finish(&mut answer, weights);
-        Some(answer)
+        (weights > 0.0).then(|| {
+            C::finish(&mut answer, weights);
+            answer
+        })
     }
 
     /// What each record that counts at `query` says there, in id order.
     pub fn contributions(&self, query: &Query) -> SmallVec<[Contribution<C>; 8]> {
         let mut near = SmallVec::new();
         self.octree.visit(query.position, |i| {
-            let (record, derived) = (self.records[i as usize], &self.derived[i as usize]);
-            let (error, weight) = self.weigh(i as usize, query);
+            let (record, derived) = (self.records[i], &self.derived[i]);
+            let (error, weight) = self.weigh(i, query);
             if weight > 0.0 {
                 let mut answer = C::Answer::default();
-                record.add(query, 1.0, derived.limit, &mut answer);
-                let a_min = self.a * record.radius_bounds().0 / derived.radius;
+                record.add(query, 1.0, self.limit(i), &mut answer);
+                let a_min = self.a * record.radius_bounds().0 / derived.radius(&record);
                 near.push(Contribution { record, error, a_min, weight, answer });
             }
             true
@@ -208,14 +226,25 @@ impl<C: Cached> Sealed<C> {
     pub fn first_a(&self, query: &Query) -> f32 {
         let mut nearest = (f32::INFINITY, RecordId(0), self.a);
         self.octree.visit(query.position, |i| {
-            let (record, derived) = (&self.records[i as usize], &self.derived[i as usize]);
-            let error = record.error(query, derived.radius, self.a);
+            let (record, derived) = (&self.records[i], &self.derived[i]);
+            let error = record.error(query, derived.radius(record), self.a);
             if error < self.a && (error, record.id()) < (nearest.0, nearest.1) {
                 nearest = (error, record.id(), derived.a);
             }
             true
         });
         (FIRST_OVER_NEAREST * nearest.2).min(self.a)
+    }
+
+    /// The records, in the order of sums.
+    pub fn records(&self) -> &[C] {
+        &self.records
+    }
+
+    /// Bytes the records take, all that is derived from them included.
+    pub fn bytes(&self) -> usize {
+        let each = size_of::<C>() + size_of::<Derived>();
+        self.records.len() * each + self.octree.bytes() + self.proposed.allocation_size()
     }
 
     /// Records in the set.
@@ -232,6 +261,20 @@ impl<C: Cached> Sealed<C> {
     pub fn digest(&self) -> Digest {
         self.digest
     }
+}
+
+impl Derived {
+    /// R the record counts with: R* within the record's bounds.
+    #[inline]
+    fn radius(&self, record: &impl Cached) -> f32 {
+        let (min, max) = record.radius_bounds();
+        self.clamped.min(max).max(min)
+    }
+}
+
+/// Where records stand: in Morton order, those of one site by id.
+fn order<C: Cached>(a: &C, b: &C) -> Ordering {
+    octree::order(a.position(), b.position()).then_with(|| a.id().cmp(&b.id()))
 }
 
 #[cfg(test)]
@@ -323,6 +366,16 @@ mod tests {
                 }
             }
         }
+    }
+
+    /// What the packed record and its place in the octree take, no more.
+    #[test]
+    fn a_record_of_irradiance_takes_at_most_160_bytes() {
+        let record = crate::irradiance::tests::sound();
+        let place = |i: u32| Vec3::new((i % 100) as f32, (i / 100) as f32, 0.0);
+        let mut sealed = Sealed::new(0.3);
+        sealed.extend((0..10_000).map(|i| Irradiance { id: RecordId(i.into()), position: place(i), ..record }));
+        assert!(sealed.bytes() <= 160 * sealed.len(), "{} bytes", sealed.bytes() as f32 / sealed.len() as f32);
     }
 
     #[test]

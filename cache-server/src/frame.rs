@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use cache_core::Namespace;
-use cache_core::rounds::{Plan, Step};
+use cache_core::rounds::Plan;
 use cache_proto::v1::frame_event::Event;
 use cache_proto::{convert, v1};
 
@@ -74,8 +74,6 @@ pub struct Frame {
     round: Option<Round>,
     steps: u32,
     fills: u32,
-    /// Passes over level 1.
-    passes: u32,
     leases_lost: u32,
     counts: BTreeMap<String, f64>,
     unfit: BTreeSet<Arc<str>>,
@@ -101,13 +99,12 @@ impl Frame {
     pub fn new(id: u64, job: Job, origin: Origin, mark: impl FnOnce(u32) -> Mark) -> Self {
         let mut frame = Self {
             id,
-            plan: Plan::new(job.spec.levels, job.spec.adaptive),
+            plan: Plan::new(job.spec.levels, job.spec.adaptive, u64::from(job.spec.width) * u64::from(job.spec.height)),
             job,
             origin,
             round: None,
             steps: 0,
             fills: 0,
-            passes: 0,
             leases_lost: 0,
             counts: BTreeMap::new(),
             unfit: BTreeSet::new(),
@@ -218,7 +215,6 @@ impl Frame {
 
     fn advance(&mut self, gathered: u64, mark: impl FnOnce(u32) -> Mark) {
         self.round = self.plan.next(gathered).map(|step| {
-            self.passes += u32::from(matches!(step, Step::Fill { level: 1, ranks: Range { start: 0, .. }, .. }));
             let mark = mark(self.steps);
             let step = convert::step(self.steps, &step, mark.position, mark.sum.digest);
             Round::new(step, &self.job)
@@ -300,7 +296,7 @@ impl Frame {
         let count = |(name, value): (&String, &f64)| v1::Count { name: name.clone(), value: *value };
         Some(Event::Done(v1::FrameDone {
             rounds: self.fills,
-            passes: self.passes,
+            passes: self.plan.passes(),
             leases_lost: self.leases_lost,
             digest: convert::digest_bytes(read.digest),
             records: read.records,

@@ -53,7 +53,7 @@ fn gathers(step: &v1::Step, tile: u32) -> u64 {
 
 /// The steps a frame must go through, and what each gathers.
 fn model(levels: u32) -> Vec<(Step, u64)> {
-    let (mut plan, mut all, mut last) = (Plan::new(levels, false), Vec::new(), 0);
+    let (mut plan, mut all, mut last) = (Plan::new(levels, false, 1), Vec::new(), 0);
     while let Some(step) = plan.next(last) {
         let wire = convert::step(all.len() as u32, &step, 0, Default::default());
         last = (0..TILES).map(|tile| gathers(&wire, tile)).sum();

@@ -215,7 +215,8 @@ pub fn reference(spec: &v1::FrameSpec, base: &[(Tag, Record)]) -> Reference {
         Arc::make_mut(&mut levels[tag.level as usize - 1]).unite([record]);
     }
     let nothing: Known = Arc::new(|_| None);
-    let (mut plan, mut gathered, mut last) = (Plan::new(spec.levels, spec.adaptive), Vec::new(), 0);
+    let size = u64::from(spec.width) * u64::from(spec.height);
+    let (mut plan, mut gathered, mut last) = (Plan::new(spec.levels, spec.adaptive, size), Vec::new(), 0);
     while let Some(step @ Step::Fill { level, .. }) = plan.next(last) {
         let tiles = 0..frame.tiles();
         let one = |tile| [frame.fill(&step, tile, &levels, &nothing).0, frame.proposals(&step, tile, &levels)].concat();

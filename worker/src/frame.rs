@@ -52,8 +52,9 @@ const LOOKS: u32 = 4;
 /// Samples by which a pixel finds out.
 const FIRST_SAMPLES: u32 = 4;
 
-/// Rays gathered for a sample of a pixel that no record covers, as a fraction: its pixel's other samples share the error.
-const MISSED_RAYS: f32 = 0.0625;
+/// Rays gathered for a sample of a pixel that no record covers, as a fraction of the least of a record, or of a quarter of those
+/// that are the same everywhere: its pixel's other samples share the error.
+const MISSED_RAYS: f32 = 0.25;
 
 /// The sealed records of every level; `[0]` is level 1. Cheap to clone.
 pub type Levels = Vec<Arc<Sealed<Irradiance>>>;
@@ -170,7 +171,9 @@ impl Frame {
     fn of(world: World, settings: Settings) -> Self {
         let namespace = settings.namespace(&world.scene.hash);
         let lights = Lights::new(&world, settings.method != Method::Path);
-        let strata = [1.0, DEEPER_RAYS, MISSED_RAYS].map(|f| Strata::new((settings.rays as f32 * f) as u32));
+        let missed = settings.effort.map_or(settings.rays / 4, |effort| effort.least_rays);
+        let share = |of: u32, part: f32| Strata::new((of as f32 * part) as u32);
+        let strata = [share(settings.rays, 1.0), share(settings.rays, DEEPER_RAYS), share(missed, MISSED_RAYS)];
         let ladder = settings.effort.map_or_else(Vec::new, |effort| {
             let rungs = std::iter::successors(Some(effort.least_rays), |rays| rays.checked_mul(2));
             rungs.take_while(|rays| *rays <= settings.rays.max(effort.least_rays)).map(Strata::new).collect()

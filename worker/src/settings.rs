@@ -109,6 +109,11 @@ impl Settings {
         }
     }
 
+    /// Pixels of the picture.
+    pub fn size(&self) -> u64 {
+        u64::from(self.width) * u64::from(self.height)
+    }
+
     /// Tiles of the picture, numbered row by row.
     pub fn tiles(&self) -> u32 {
         self.width.div_ceil(TILE) * self.height.div_ceil(TILE)

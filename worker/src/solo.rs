@@ -43,12 +43,11 @@ pub fn fill(frame: &Frame, order: Order) -> Levels {
 pub fn fill_ranks(frame: &Frame, order: Order, end: u32) -> Filled {
     let (a, details) = (frame.settings().a, frame.settings().details);
     let mut levels: Levels = (0..frame.levels()).map(|_| Arc::new(Sealed::with(a, details))).collect();
-    let (mut counts, mut passes, mut proposals, mut sealing_seconds) = (Counts::default(), 0, 0, 0.0);
-    let mut plan = Plan::new(frame.levels(), details.adaptive);
+    let (mut counts, mut proposals, mut sealing_seconds) = (Counts::default(), 0, 0.0);
+    let mut plan = Plan::new(frame.levels(), details.adaptive, frame.settings().size());
     let mut gathered = 0;
     while let Some(Step::Fill { level, pass, ranks }) = plan.next(gathered) {
         gathered = 0;
-        passes += u32::from(level == 1 && ranks.start == 0);
         if end < RANKS && (pass > 0 || ranks.start >= end) {
             continue;
         }
@@ -77,7 +76,7 @@ pub fn fill_ranks(frame: &Frame, order: Order, end: u32) -> Filled {
             }
         }
     }
-    Filled { levels, counts, passes, proposals, sealing_seconds }
+    Filled { levels, counts, passes: plan.passes(), proposals, sealing_seconds }
 }
 
 fn chunks(tiles: u32, size: u32) -> impl Iterator<Item = std::ops::Range<u32>> {
