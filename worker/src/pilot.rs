@@ -49,7 +49,7 @@ const WELL_SPREAD: f64 = 0.7;
 const RECORDS_AT_ONCE: f64 = 1.3;
 
 /// A gather traces at least an average one's rays divided by this.
-const LEAST: f64 = 4.0;
+const LEAST: f64 = 2.0;
 const LEAST_RANGE: (u32, u32) = (16, 2048);
 
 /// Time a look into the cache takes, in rays.
