@@ -27,6 +27,9 @@ use crate::progress::{Progress, phase_name};
 use crate::say;
 use crate::stats::{Stats, hex};
 
+/// Share of samples that gathered for themselves from which the closing line says so.
+const TOLD_FROM: f64 = 0.02;
+
 /// Own processes that died and are started again, all together.
 const RESTARTS: u32 = 3;
 
@@ -390,7 +393,7 @@ impl Render<'_> {
             return Ok(());
         }
         say::result(format_args!(
-            "{} and {}: {seconds:.1} s, {} records, {} rounds{}",
+            "{} and {}: {seconds:.1} s, {} records, {} rounds{}{}",
             self.args.output.display(),
             self.args.png().display(),
             done.records,
@@ -398,9 +401,23 @@ impl Render<'_> {
             job.forecast.map_or(String::new(), |(asked, forecast)| {
                 let believed = 100.0 * believed(&forecast, done).total();
                 format!("; error asked {} %, believed {believed:.2} %", 100.0 * asked)
-            })
+            }),
+            gathered_per_sample(done)
         ))
     }
+}
+
+/// Where records did not pay, if that was more than here and there.
+fn gathered_per_sample(done: &v1::FrameDone) -> String {
+    let count = |name: &str| done.counts.iter().filter(|c| c.name == name).map(|c| c.value).sum::<f64>();
+    let share = count("regathers") / count("samples").max(1.0);
+    if share < TOLD_FROM {
+        return String::new();
+    }
+    format!(
+        "; {:.0} % of the samples gathered for themselves, where records would be as dense as pixels",
+        100.0 * share
+    )
 }
 
 /// Why a picture may be black.

@@ -85,6 +85,8 @@ impl Stats {
             "rays": { "path": by_phase("rays.path.", whole), "shadow": by_phase("rays.shadow.", whole) },
             "queries": count("queries"),
             "misses": count("misses"),
+            "gathered_per_sample": count("regathers"),
+            "candidates_left_dense": count("dense"),
             "samples": count("samples"),
             "bytes": {
                 "records_inserted": count("bytes.inserted"),

@@ -22,6 +22,8 @@ fn matter(color: f32, surface: Surface) -> Material {
         surface,
         emission: Rgb::ZERO,
         double_sided: true,
+        bumps: None,
+        cached: true,
     }
 }
 

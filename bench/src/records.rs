@@ -57,7 +57,7 @@ pub fn batches(namespace: &Namespace, count: u64, size: u64) -> Vec<RecordBatch>
 pub fn points(count: u64) -> Vec<Query> {
     let mut random = Random::named("points of a benchmark", &[count]);
     let mut next = || random.uniform();
-    (0..count).map(|_| Query { position: Vec3::new(next(), next(), 0.0), normal: Vec3::Z }).collect()
+    (0..count).map(|_| Query::new(Vec3::new(next(), next(), 0.0), Vec3::Z)).collect()
 }
 
 /// Points as a request carries them.

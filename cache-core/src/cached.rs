@@ -7,13 +7,22 @@ use glam::Vec3;
 
 use crate::id::RecordId;
 
-/// Where an answer is wanted: a point and its unit normal.
+/// Where an answer is wanted: a point of a surface.
 #[derive(Clone, Copy, Debug)]
 pub struct Query {
     /// World position.
     pub position: Vec3,
-    /// Unit normal.
+    /// Unit normal of the surface, by which records are found and weighed.
     pub normal: Vec3,
+    /// Unit normal the answer is for: another one where the surface has bumps too small for records of their own.
+    pub shading: Vec3,
+}
+
+impl Query {
+    /// Where a surface has no bumps.
+    pub fn new(position: Vec3, normal: Vec3) -> Self {
+        Self { position, normal, shading: normal }
+    }
 }
 
 /// What makes a record unfit to be kept. Checked in one place, [`Packed::decode`], whoever sent the bytes.

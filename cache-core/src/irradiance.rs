@@ -95,12 +95,13 @@ impl Cached for Irradiance {
         translation + rotation
     }
 
-    /// Ward 1992 eq. 6: E_i + (n_i × n)·∇_r E_i + (p - p_i)·∇_t E_i, never below 0.
+    /// Ward 1992 eq. 6: E_i + (n_i × n)·∇_r E_i + (p - p_i)·∇_t E_i, never below 0; n is the shading normal, so that bumps
+    /// cost no records.
     #[inline]
     fn add(&self, query: &Query, weight: f32, limit: f32, answer: &mut Answer) {
         let frame = Frame::around(self.normal);
         let shift = frame.tangential(query.position - self.position) * limit;
-        let turn = frame.tangential(self.normal.cross(query.normal));
+        let turn = frame.tangential(self.normal.cross(query.shading));
         let change = |c: usize| self.gradient_t[c].dot(shift) + self.gradient_r[c].dot(turn);
         let estimate = self.irradiance + Vec3::new(change(0), change(1), change(2));
         answer.irradiance += estimate.max(Vec3::ZERO) * weight;
@@ -344,7 +345,7 @@ pub(crate) mod tests {
     #[test]
     fn weight_falls_to_zero_at_the_border_and_excludes_what_lies_behind() {
         let r = sound();
-        let at = |offset: Vec3| Query { position: r.position + offset, normal: r.normal };
+        let at = |offset: Vec3| Query::new(r.position + offset, r.normal);
         let weight = |query: &Query| Weighting::InverseToZero.weight(r.error(query, 2.0, 0.3), 0.3);
         assert!(weight(&at(Vec3::X * 0.5)) > 0.0);
         assert!(weight(&at(Vec3::X * 0.599)) < 0.01);
@@ -362,7 +363,7 @@ pub(crate) mod tests {
         // Semi-axes 1 and 4: at a = 0.3, 0.3 along x and, but for R = 2, 1.2 along y.
         let r = Irradiance { ellipse: [1.0, 0.0, 1.0 / 16.0], ..sound() };
         let reaches = |offset: Vec3| {
-            let query = Query { position: r.position + offset, normal: r.normal };
+            let query = Query::new(r.position + offset, r.normal);
             r.error(&query, 2.0, 0.3) < 0.3
         };
         assert!(reaches(frame.x * 0.29) && !reaches(frame.x * 0.31));

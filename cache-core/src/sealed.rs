@@ -330,7 +330,7 @@ mod tests {
             in_steps.shrink(shrinks.flatten().copied());
             prop_assert_eq!(at_once.digest(), in_steps.digest());
             for p in points {
-                let query = Query { position: Vec3::from(p), normal: Vec3::Z };
+                let query = Query::new(Vec3::from(p), Vec3::Z);
                 let (a, b) = (at_once.ask(&query), in_steps.ask(&query));
                 prop_assert_eq!(a.map(|a| a.irradiance.to_array().map(f32::to_bits)),
                                 b.map(|b| b.irradiance.to_array().map(f32::to_bits)));
@@ -340,7 +340,7 @@ mod tests {
                 prop_assert_eq!(at_once.first_a(&query).to_bits(), in_steps.first_a(&query).to_bits());
             }
             for record in &records {
-                let site = Query { position: record.position, normal: record.normal };
+                let site = Query::new(record.position, record.normal);
                 prop_assert!(at_once.covers(&site));
             }
         }
@@ -354,7 +354,7 @@ mod tests {
             let mut sealed = Sealed::new(0.8);
             sealed.extend(records.iter().copied());
             for p in points {
-                let query = Query { position: Vec3::from(p), normal: Vec3::Z };
+                let query = Query::new(Vec3::from(p), Vec3::Z);
                 let near = sealed.contributions(&query);
                 for c in near.iter().filter(|c| c.error > c.a_min) {
                     let counts = |a: f32| {
@@ -383,7 +383,7 @@ mod tests {
         let null = |id, x| Null { id: RecordId(id), position: Vec3::X * x, radius: 1.0 };
         let mut sealed = Sealed::new(1.0);
         sealed.extend([null(1, 0.0), null(2, 0.5)]);
-        let at = |x| Query { position: Vec3::X * x, normal: Vec3::Z };
+        let at = |x| Query::new(Vec3::X * x, Vec3::Z);
         assert_eq!(sealed.first_a(&at(0.3)), 1.0);
         sealed.shrink([Shrink::new(RecordId(1), 0.1), Shrink::new(RecordId(2), 0.2), Shrink::new(RecordId(1), 0.3)]);
         assert!(!sealed.covers(&at(0.2)) && sealed.covers(&at(0.09)) && sealed.covers(&at(0.31)));
@@ -398,7 +398,7 @@ mod tests {
         let null = |id, x, radius| Null { id: RecordId(id), position: Vec3::X * x, radius };
         let mut sealed = Sealed::new(1.0);
         sealed.extend([null(1, 0.0, 10.0), null(2, 1.0, 0.5)]);
-        let at = |x| Query { position: Vec3::X * x, normal: Vec3::Z };
+        let at = |x| Query::new(Vec3::X * x, Vec3::Z);
         // The second record clamps the first to 0.5 + 1.
         assert_eq!(sealed.ask(&at(-1.4)), Some(1));
         assert_eq!(sealed.ask(&at(-1.6)), None);

@@ -124,7 +124,7 @@ fn point(index: usize, bytes: &[u8]) -> Result<Query, Refusal> {
         *value = f32::from_le_bytes([four[0], four[1], four[2], four[3]]);
     }
     let [px, py, pz, nx, ny, nz] = floats;
-    let query = Query { position: Vec3::new(px, py, pz), normal: Vec3::new(nx, ny, nz) };
+    let query = Query::new(Vec3::new(px, py, pz), Vec3::new(nx, ny, nz));
     if !query.position.is_finite() || !query.normal.is_finite() {
         return Err(Refusal::field("points", format!("point {index} is not finite")));
     }

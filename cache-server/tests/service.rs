@@ -243,7 +243,7 @@ async fn query_answers_what_a_replica_would_bit_for_bit() {
     let server = Server::tcp().await;
     let mut cache = server.cache();
     let queries: Vec<_> = (0..500)
-        .map(|i| Query { position: Vec3::new((i % 50) as f32 * 0.21, (i / 50) as f32 * 0.07, 0.01), normal: Vec3::Z })
+        .map(|i| Query::new(Vec3::new((i % 50) as f32 * 0.21, (i / 50) as f32 * 0.07, 0.01), Vec3::Z))
         .collect();
     // Twice, because the second has to see what was added after the first.
     for (from, to) in [(0, 150), (150, 300)] {
@@ -284,7 +284,7 @@ async fn query_answers_what_a_replica_would_bit_for_bit() {
 async fn unsound_queries_are_refused_by_name() {
     let server = Server::unix().await;
     let mut cache = server.cache();
-    let point = Query { position: Vec3::ONE, normal: Vec3::X };
+    let point = Query::new(Vec3::ONE, Vec3::X);
     let many = |count| points(&vec![point; count]).into();
     let good = v1::QueryRequest { namespace: NAMESPACE.0.to_vec().into(), level: 1, a: 1.0, points: many(65536) };
     let spoilt = [

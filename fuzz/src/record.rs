@@ -45,7 +45,7 @@ pub fn record(data: &[u8]) {
         let far = |record: &Irradiance| record.position.abs().max_element() + counts(record);
         let extent = sound.values().map(far).fold(0.0, f32::max);
         for record in sound.values().filter(|record| counts(record) > RESOLVED * extent) {
-            let site = Query { position: record.position, normal: record.normal };
+            let site = Query::new(record.position, record.normal);
             assert!(at_once.covers(&site), "{record:?}");
             let beside = Query { position: record.position + Vec3::splat(record.radius * a * 0.3), ..site };
             for query in [site, beside] {

@@ -122,7 +122,7 @@ impl MadeUp {
             return Vec::new();
         }
         let sites = (0..4).flat_map(|pass| self.sites(*level, pass, ranks.start, tile));
-        let at = |position| levels[*level as usize - 1].contributions(&Query { position, normal: Vec3::Z });
+        let at = |position| levels[*level as usize - 1].contributions(&Query::new(position, Vec3::Z));
         let a = A * (0.5 + 0.4 * Random::named("a", &[digest(levels).0 as u64, tile.into()]).uniform());
         let shrinks: BTreeSet<_> = sites.flat_map(at).map(|near| near.record.id).collect();
         shrinks.into_iter().map(|of| Shrink::new(of, a).into()).collect()
@@ -134,7 +134,7 @@ impl MadeUp {
         let (sealed, read) = (&levels[*level as usize - 1], digest(levels));
         let (mut records, mut found) = (Vec::new(), 0);
         for position in self.sites(*level, *pass, ranks.start, tile) {
-            if sealed.covers(&Query { position, normal: Vec3::Z }) {
+            if sealed.covers(&Query::new(position, Vec3::Z)) {
                 continue;
             }
             let site = position.to_array();

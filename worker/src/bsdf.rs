@@ -276,6 +276,8 @@ mod tests {
             surface,
             emission: Rgb::ZERO,
             double_sided: true,
+            bumps: None,
+            cached: true,
         }
     }
 

@@ -95,7 +95,7 @@ mod tests {
         let points = (0..27).map(|i| Vec3::new((i % 3) as f32, (i / 3 % 3) as f32, (i / 9) as f32) * 0.9);
         points
             .flat_map(|position| {
-                let query = Query { position, normal: Vec3::Z };
+                let query = Query::new(position, Vec3::Z);
                 levels.iter().map(move |l| l.ask(&query).map(|a| a.irradiance.to_array().map(f32::to_bits)))
             })
             .collect()

@@ -46,6 +46,12 @@ const DEEPER_RAYS: f32 = 0.5;
 /// The same for gathers that trace as many rays as light varies.
 const DEEPER_EFFORT: f32 = 0.25;
 
+/// From which part of a pass on a tile may show that records do not pay there.
+const DENSE_FROM: f32 = 0.5;
+
+/// From how many candidates of a tile in one round.
+const DENSE_TESTED: usize = 8;
+
 /// Shadow rays of each sample of a pixel, where samples are as many as light varies.
 const LOOKS: u32 = 4;
 
@@ -70,6 +76,10 @@ pub struct Counts {
     pub queries: u64,
     /// Those that found no record and went on as paths.
     pub misses: u64,
+    /// Of the misses, samples of pixels that gathered for themselves.
+    pub regathers: u64,
+    /// Candidates left uncovered because records would have been as dense as pixels.
+    pub dense: u64,
     /// Records that were found and not gathered again.
     pub reused: u64,
     /// Samples of finished pixels.
@@ -118,6 +128,8 @@ impl Counts {
         self.shadow_rays += other.shadow_rays;
         self.queries += other.queries;
         self.misses += other.misses;
+        self.regathers += other.regathers;
+        self.dense += other.dense;
         self.reused += other.reused;
         self.samples += other.samples;
         self.surfaces.add(&other.surfaces);
@@ -227,9 +239,10 @@ impl Frame {
         let own = sealed.get(level as usize - 1).filter(|own| !own.is_empty());
         let tracer = self.tracer(sealed);
         let (mut uncovered, mut proposals) = (Vec::new(), Proposals::default());
-        let clock = CpuClock::start();
+        let (clock, mut tested) = (CpuClock::start(), 0);
         for [x, y] in self.settings.pixels(tile).filter(|[x, y]| ranks.contains(&rounds::rank(*x, *y))) {
             let Some(site) = self.site(level, pass, x, y, &mut counts) else { continue };
+            tested += 1;
             let covered = match own {
                 Some(own) if adaptive && rounds::refines(level, pass) => {
                     proposals.test(&tracer, &site, own, &mut counts)
@@ -242,6 +255,13 @@ impl Frame {
             }
         }
         counts.test_seconds += clock.seconds();
+        // Where most candidates still want a record of their own, records would be as dense as pixels, which gather for
+        // themselves when they are made. Of deeper levels there are few candidates anyway, all over the scene.
+        let late = level == 1 && self.is_late(pass, ranks.start);
+        if late && tested >= DENSE_TESTED && 2 * uncovered.len() > tested {
+            counts.dense += uncovered.len() as u64;
+            uncovered.clear();
+        }
         // The level being filled is no business of its own gathers.
         let gather = Gather {
             tracer: &tracer,
@@ -263,6 +283,12 @@ impl Frame {
         }
         records.extend(proposals.take().map(Record::from));
         (records, counts)
+    }
+
+    /// Whether a round of level 1 comes so late that a picture worth caching is covered for the most part.
+    fn is_late(&self, pass: u32, rank: u32) -> bool {
+        let ranks = rounds::ranks(1, pass, self.settings.size());
+        pass > 0 || (rank - ranks.start) as f32 >= DENSE_FROM * ranks.len() as f32
     }
 
     /// How many rays a record of a level is made of.
@@ -304,6 +330,10 @@ impl Frame {
             way += at.distance;
             let bsdf = self.world.bsdf(&at)?;
             if depth == level {
+                if !self.world.cached(&at) {
+                    return None;
+                }
+                let at = at.flattened();
                 let deeper = usize::from(level > 1);
                 let pixels = (REACH_MIN_HEIGHT[deeper] * s.height as f32).max(REACH_MIN_PIXELS[deeper]);
                 let reach = match s.details.spacing {

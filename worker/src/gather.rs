@@ -46,7 +46,7 @@ pub enum Rays<'a> {
 impl Site {
     /// What a sealed cache is asked there.
     pub fn query(&self) -> Query {
-        Query { position: self.at.position, normal: self.at.normal() }
+        self.at.query()
     }
 }
 

@@ -5,7 +5,6 @@
 //! against gathers made there). Each gets a share of the mean square that is asked for; what one cannot use falls
 //! to the others. The pilot depends on scene, view, error and seed alone, so its choice is the same everywhere.
 
-use cache_core::Query;
 use cache_core::hemisphere::Strata;
 use cache_core::id::Random;
 use cache_core::rounds::{RANKS, rank};
@@ -222,8 +221,7 @@ fn probe(frame: &Frame, levels: &Levels, counts: &mut Counts) -> f64 {
     for _ in 0..PROBES {
         // Another point of the pixel than the one records are made for.
         let Some(site) = frame.site(1, 1, place(settings.width), place(settings.height), counts) else { continue };
-        let query = Query { position: site.at.position, normal: site.at.normal() };
-        let Some(answer) = levels[0].ask(&query) else { continue };
+        let Some(answer) = levels[0].ask(&site.query()) else { continue };
         let truth = gather.record(gather.id(&site), &site, counts);
         let square = (truth.irradiance - answer.irradiance).length_squared() / 3.0;
         let explained = truth.noise * truth.noise + answer.noise * answer.noise;

@@ -93,7 +93,8 @@ fn run(frame: &Frame, work: &Work) -> Option<Done> {
 impl Done {
     /// The counts of `Complete`: `cpu_seconds.PHASE`, `records.PHASE`, `rays.path.PHASE`, `rays.shadow.PHASE` (PHASE is
     /// `level N` or `pixels`), `cpu_seconds.tests` (of those of the levels, what was not spent on gathers), `proposals`,
-    /// `queries`, `misses`, `reused` (of the records, those found), and of bytes on the wire `bytes.inserted` and
+    /// `queries`, `misses`, `regathers` (of the misses, samples of pixels that gathered for themselves), `dense` (candidates left
+    /// alone where records would be as dense as pixels), `reused` (of the records, those found), and of bytes on the wire `bytes.inserted` and
     /// `bytes.subscribed` (packed records), `bytes.tiles` (packed pixels).
     pub fn counts(&self, step: &v1::Step, inserted: u64, subscribed: u64) -> Vec<v1::Count> {
         let phase = match step.level {
@@ -111,6 +112,8 @@ impl Done {
             (format!("rays.shadow.{phase}"), self.counts.shadow_rays as f64),
             ("queries".into(), self.counts.queries as f64),
             ("misses".into(), self.counts.misses as f64),
+            ("regathers".into(), self.counts.regathers as f64),
+            ("dense".into(), self.counts.dense as f64),
             ("reused".into(), self.counts.reused as f64),
             ("samples".into(), self.counts.samples as f64),
             ("bytes.inserted".into(), inserted as f64),

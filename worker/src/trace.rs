@@ -8,7 +8,6 @@
 
 use std::f32::consts::FRAC_1_PI;
 
-use cache_core::Query;
 use cache_core::hemisphere::{Sample, Strata, irradiance};
 use cache_core::id::Random;
 use cache_core::irradiance::Answer;
@@ -175,17 +174,21 @@ impl Tracer<'_> {
         if bsdf.diffuse() == Rgb::ZERO {
             return None;
         }
+        if !self.world.cached(at) {
+            return None;
+        }
         let Some(level) = self.levels.get(depth as usize - 1) else {
             // The last bounce reflects lamps, which shadow rays find, and gathered light: without any, nothing is left.
             let nothing_left = self.cached && depth - 1 == self.bounces && !self.lights.any_gathered();
             return nothing_left.then(Answer::default);
         };
         counts.queries += 1;
-        let answer = level.ask(&Query { position: at.position, normal: at.normal() });
+        let answer = level.ask(&at.query());
         if answer.is_some() {
             return answer;
         }
         counts.misses += 1;
+        counts.regathers += u64::from(self.regather.is_some());
         self.regather.map(|strata| {
             // Only what the camera sees is worth a gather of its own: its rays follow paths.
             let tracer = Tracer { regather: None, ..*self };

@@ -1,7 +1,8 @@
 //! A scene ready to trace: what a ray meets, and from where the next ray may start.
 
+use cache_core::Query;
 use cache_core::math::Frame;
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 
 use crate::bsdf::Bsdf;
 use crate::bvh::Bvh;
@@ -32,7 +33,9 @@ pub struct Meeting {
     pub distance: f32,
     /// Unit geometric normal.
     pub facet: Vec3,
-    /// Frame round the unit shading normal.
+    /// Unit normal of the smooth surface.
+    pub smooth: Vec3,
+    /// Frame round the unit shading normal, which bumps tilt.
     pub frame: Frame,
     /// Which triangle.
     pub triangle: u32,
@@ -67,23 +70,45 @@ impl World {
         let geometric = facet(triangle);
         let front = geometric.dot(direction) < 0.0;
         let facet = if front { geometric } else { -geometric };
-        let normal = triangle.normals.map_or(facet, |normals| {
+        let smooth = triangle.normals.map_or(facet, |normals| {
             let smooth = blend(&normals, weights).normalize_or(geometric);
             let smooth = if front { smooth } else { -smooth };
             // Seen from behind by its own shading normal: fall back on the facet.
             if smooth.dot(direction) < 0.0 { smooth } else { facet }
         });
-        let frame = Frame::around(normal);
+        let bumped = self.bumped(triangle, weights, if front { smooth } else { -smooth });
+        let bumped = bumped.map(|normal| if front { normal } else { -normal });
+        let shading = bumped.filter(|normal| normal.dot(direction) < 0.0).unwrap_or(smooth);
         Some(Meeting {
             position,
             distance: hit.t,
             facet,
-            frame,
+            smooth,
+            frame: Frame::around(shading),
             triangle: hit.triangle,
             front,
             weights,
             lift: lift(triangle),
         })
+    }
+
+    /// The normal that the material's bumps make of a smooth one of the front. The tangent is that of the texture coordinates.
+    fn bumped(&self, triangle: &Triangle, weights: [f32; 3], smooth: Vec3) -> Option<Vec3> {
+        let bumps = self.scene.materials[triangle.material as usize].bumps?;
+        let [a, b, c] = triangle.positions;
+        let [s, t] = [triangle.uvs[1] - triangle.uvs[0], triangle.uvs[2] - triangle.uvs[0]];
+        let along = ((b - a) * t.y - (c - a) * s.y) * s.perp_dot(t).signum();
+        let tangent = along.reject_from_normalized(smooth).try_normalize()?;
+        let texel = self.scene.textures[bumps.texture as usize].sample(texture_place(triangle, weights)) * 2.0 - 1.0;
+        // Of a mirrored picture v runs the other way. In glTF green points to where v falls.
+        let beside = smooth.cross(tangent) * s.perp_dot(t).signum();
+        let tilted = tangent * texel.x * bumps.scale - beside * texel.y * bumps.scale + smooth * texel.z;
+        tilted.try_normalize()
+    }
+
+    /// Whether records may answer for what is reflected there.
+    pub fn cached(&self, at: &Meeting) -> bool {
+        self.scene.materials[self.scene.triangles[at.triangle as usize].material as usize].cached
     }
 
     /// Whether something lies between two points that are already off their surfaces.
@@ -108,9 +133,8 @@ impl World {
         let color = match material.texture {
             None => material.color,
             Some(texture) => {
-                let weights = at.weights;
-                let at = triangle.uvs[0] * weights[0] + triangle.uvs[1] * weights[1] + triangle.uvs[2] * weights[2];
-                material.color * self.scene.textures[texture as usize].sample(at)
+                let place = texture_place(triangle, at.weights);
+                material.color * self.scene.textures[texture as usize].sample(place)
             }
         };
         Some(Bsdf::new(material, color))
@@ -140,6 +164,16 @@ impl Meeting {
         Place { position: self.position, normal: self.normal() }
     }
 
+    /// What a sealed cache is asked there.
+    pub fn query(&self) -> Query {
+        Query { position: self.position, normal: self.smooth, shading: self.normal() }
+    }
+
+    /// The same point of a surface without bumps.
+    pub fn flattened(self) -> Self {
+        Self { frame: Frame::around(self.smooth), ..self }
+    }
+
     /// Unit shading normal.
     pub fn normal(&self) -> Vec3 {
         self.frame.z
@@ -159,14 +193,16 @@ fn blend(corners: &[Vec3; 3], weights: [f32; 3]) -> Vec3 {
     corners[0] * weights[0] + corners[1] * weights[1] + corners[2] * weights[2]
 }
 
+fn texture_place(triangle: &Triangle, weights: [f32; 3]) -> Vec2 {
+    triangle.uvs[0] * weights[0] + triangle.uvs[1] * weights[1] + triangle.uvs[2] * weights[2]
+}
+
 fn lift(triangle: &Triangle) -> f32 {
     LIFT * triangle.positions.iter().map(|p| p.abs().max_element()).fold(0.0, f32::max)
 }
 
 #[cfg(test)]
 mod tests {
-    use glam::Vec2;
-
     use super::*;
 
     #[test]

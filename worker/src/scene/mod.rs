@@ -67,6 +67,19 @@ pub struct Material {
     pub emission: Rgb,
     /// When false, the back face is black: it stops light and gives none.
     pub double_sided: bool,
+    /// Tilts of the shading normal.
+    pub bumps: Option<Bumps>,
+    /// When false, records are neither made nor asked there; paths are followed in their place.
+    pub cached: bool,
+}
+
+/// Normals from a picture: (x, y, z) as 2 texel - 1, z along the smooth normal, as in glTF.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bumps {
+    /// Index into `Scene::textures`.
+    pub texture: u32,
+    /// Multiplies x and y.
+    pub scale: f32,
 }
 
 /// The reflection models.
@@ -110,7 +123,7 @@ pub struct Texture {
     pub width: u32,
     /// Rows.
     pub height: u32,
-    /// Linear RGB, row by row; row 0 at v = 0, as in glTF.
+    /// Linear RGB, or what else three numbers may be, row by row; row 0 at v = 0, as in glTF.
     pub texels: Vec<Rgb>,
     /// What happens outside 0..1, for u and v.
     pub wrap: [Wrap; 2],
@@ -230,7 +243,10 @@ fn content_hash(scene: &Scene) -> [u8; 32] {
     for m in &scene.materials {
         add(&m.color.to_array());
         add(&m.emission.to_array());
-        add(&[f32::from_bits(m.texture.unwrap_or(u32::MAX)), f32::from(m.double_sided)]);
+        add(&[f32::from_bits(m.texture.unwrap_or(u32::MAX)), f32::from(m.double_sided), f32::from(m.cached)]);
+        if let Some(Bumps { texture, scale }) = m.bumps {
+            add(&[f32::from_bits(texture), scale]);
+        }
         match m.surface {
             Surface::Diffuse => add(&[0.0]),
             Surface::Gltf { metallic, roughness, specular, specular_color: c, ior } => {

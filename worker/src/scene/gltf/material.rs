@@ -4,13 +4,14 @@ use std::collections::HashMap;
 
 use ::gltf::json::Index;
 use ::gltf::json::extensions::material::Material as Extensions;
-use ::gltf::json::material::{AlphaMode, Material as Source, PbrMetallicRoughness};
+use ::gltf::json::material::{AlphaMode, Material as Source, NormalTexture, PbrMetallicRoughness};
 use ::gltf::json::texture::{Info, MagFilter, Sampler, Texture as TextureSource, WrappingMode};
 use ::gltf::json::validation::Checked;
 
 use super::container::{Document, beyond};
+use super::picture::Meaning;
 use super::{Fault, name, picture};
-use crate::scene::{Material, Rgb, Surface, Texture, Wrap};
+use crate::scene::{Bumps, Material, Rgb, Surface, Texture, Wrap};
 
 /// The materials read so far.
 pub(super) struct Materials<'a> {
@@ -23,8 +24,8 @@ pub(super) struct Materials<'a> {
     pub(super) warnings: Vec<String>,
     /// By index in the file; `None` is the default material.
     read: HashMap<Option<usize>, MaterialUse>,
-    /// By image and wrap modes.
-    pictures: HashMap<(usize, [u8; 2]), PictureUse>,
+    /// By image, wrap modes and what it means.
+    pictures: HashMap<(usize, [u8; 2], Meaning), PictureUse>,
 }
 
 /// What a primitive must know about its material.
@@ -89,8 +90,18 @@ impl<'a> Materials<'a> {
         let surface = surface(pbr, extensions)?;
         let emission = emission(source, extensions)?;
         let texture = pbr.base_color_texture.as_ref();
-        let picture = texture.map(|info| self.texture(info, title)).transpose();
-        let picture = picture.map_err(|fault| format!("baseColorTexture: {fault}"))?;
+        let used = texture.map(|info| Used::of("baseColorTexture", info, Meaning::Colors));
+        let picture = used.map(|used| self.texture(&used, title)).transpose()?;
+        let normal = source.normal_texture.as_ref().map(|info| (Used::of_normals(info), info.scale));
+        let bumps = normal.map(|(used, scale)| self.bumps(&used, scale, title)).transpose()?;
+        let sets = [texture.map(|t| t.tex_coord), source.normal_texture.as_ref().map(|t| t.tex_coord)];
+        if let [Some(color), Some(normal)] = sets
+            && color != normal
+        {
+            return Err(format!(
+                "baseColorTexture uses TEXCOORD_{color}, normalTexture TEXCOORD_{normal}; expected one set for both"
+            ));
+        }
         check_opaque(source, picture.is_some_and(|p| p.has_alpha))?;
         self.materials.push(Material {
             name: source.name.clone().unwrap_or_else(|| title.into()),
@@ -99,41 +110,86 @@ impl<'a> Materials<'a> {
             surface,
             emission,
             double_sided: source.double_sided,
+            bumps,
+            cached: cached(source)?,
         });
-        Ok(texture.map(|info| info.tex_coord))
+        Ok(sets[0].or(sets[1]))
     }
 
-    fn texture(&mut self, info: &Info, title: &str) -> Result<PictureUse, Fault> {
-        if let Some(extension) = info.extensions.iter().flat_map(|e| e.others.keys()).next() {
+    fn bumps(&mut self, used: &Used, scale: f32, title: &str) -> Result<Bumps, Fault> {
+        if !scale.is_finite() {
+            return Err(format!("normalTexture: scale is {scale}; expected a finite number"));
+        }
+        Ok(Bumps { texture: self.texture(used, title)?.index, scale })
+    }
+
+    fn texture(&mut self, used: &Used, title: &str) -> Result<PictureUse, Fault> {
+        self.picture(used, title).map_err(|fault| format!("{}: {fault}", used.field))
+    }
+
+    fn picture(&mut self, used: &Used, title: &str) -> Result<PictureUse, Fault> {
+        if let Some(extension) = &used.extension {
             return Err(format!("extension {extension} is not supported"));
         }
         let root = &self.document.root;
         let texture: &TextureSource =
-            root.get(info.index).ok_or_else(|| format!("texture {} {}", info.index, beyond(root.textures.len())))?;
+            root.get(used.index).ok_or_else(|| format!("texture {} {}", used.index, beyond(root.textures.len())))?;
         let sampler = match texture.sampler {
             None => Sampler::default(),
             Some(i) => root.get(i).cloned().ok_or_else(|| format!("sampler {i} {}", beyond(root.samplers.len())))?,
         };
         let wrap = [wrap("wrapS", sampler.wrap_s)?, wrap("wrapT", sampler.wrap_t)?];
         if matches!(sampler.mag_filter, Some(Checked::Valid(MagFilter::Nearest))) {
-            self.warnings.push(format!("{title}: baseColorTexture is filtered bilinearly in place of NEAREST"));
+            self.warnings.push(format!("{title}: {} is filtered bilinearly in place of NEAREST", used.field));
         }
-        let key = (texture.source.value(), wrap.map(|w| w as u8));
+        let key = (texture.source.value(), wrap.map(|w| w as u8), used.meaning);
         if let Some(&known) = self.pictures.get(&key) {
             return Ok(known);
         }
         let image = root.get(texture.source).ok_or_else(|| match texture.source.value() as u32 {
             // What the crate reads where the field is missing.
-            u32::MAX => format!("texture {} has no source; expected a PNG or JPEG image", info.index),
+            u32::MAX => format!("texture {} has no source; expected a PNG or JPEG image", used.index),
             _ => format!("image {} {}", texture.source, beyond(root.images.len())),
         })?;
-        let picture = picture::read(self.document, image);
+        let picture = picture::read(self.document, image, used.meaning);
         let picture = picture.map_err(|fault| format!("image {}: {fault}", texture.source))?;
         let known = PictureUse { index: count(self.textures.len()), has_alpha: picture.has_alpha };
         let picture::Picture { width, height, texels, .. } = picture;
         self.textures.push(Texture { width, height, texels, wrap });
         self.pictures.insert(key, known);
         Ok(known)
+    }
+}
+
+/// A texture as a material uses it.
+struct Used {
+    field: &'static str,
+    index: Index<TextureSource>,
+    meaning: Meaning,
+    /// One that is not known here.
+    extension: Option<String>,
+}
+
+impl Used {
+    fn of(field: &'static str, info: &Info, meaning: Meaning) -> Self {
+        let extension = info.extensions.iter().flat_map(|e| e.others.keys()).next().cloned();
+        Self { field, index: info.index, meaning, extension }
+    }
+
+    fn of_normals(info: &NormalTexture) -> Self {
+        let extension = info.extensions.iter().flat_map(|e| e.others.keys()).next().cloned();
+        Self { field: "normalTexture", index: info.index, meaning: Meaning::Numbers, extension }
+    }
+}
+
+/// What extras say of records there: `{"ambience_cached": false}` follows paths in their place.
+fn cached(source: &Source) -> Result<bool, Fault> {
+    let Some(extras) = &source.extras else { return Ok(true) };
+    let extras: serde_json::Value = serde_json::from_str(extras.get()).map_err(|e| format!("extras: {e}"))?;
+    match extras.get("ambience_cached") {
+        None => Ok(true),
+        Some(serde_json::Value::Bool(cached)) => Ok(*cached),
+        Some(other) => Err(format!("extras.ambience_cached is {other}; expected true or false")),
     }
 }
 
@@ -149,13 +205,12 @@ fn check_supported(source: &Source, extensions: &Extensions) -> Result<(), Fault
     let specular = extensions.specular.as_ref();
     let textures = [
         ("metallicRoughnessTexture", source.pbr_metallic_roughness.metallic_roughness_texture.is_some()),
-        ("normalTexture", source.normal_texture.is_some()),
         ("emissiveTexture", source.emissive_texture.is_some()),
         ("specularTexture", specular.is_some_and(|s| s.specular_texture.is_some())),
         ("specularColorTexture", specular.is_some_and(|s| s.specular_color_texture.is_some())),
     ];
     match textures.into_iter().find(|(_, used)| *used) {
-        Some((field, _)) => Err(format!("{field} is not supported; only baseColorTexture is")),
+        Some((field, _)) => Err(format!("{field} is not supported; only baseColorTexture and normalTexture are")),
         None => Ok(()),
     }
 }

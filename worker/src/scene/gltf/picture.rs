@@ -24,16 +24,25 @@ pub(super) struct Picture {
     pub(super) has_alpha: bool,
 }
 
-/// Reads and decodes an image; its colours are sRGB.
-pub(super) fn read(document: &Document, image: &Image) -> Result<Picture, Fault> {
+/// What the numbers of an image mean.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) enum Meaning {
+    /// Colours, as sRGB has them.
+    Colors,
+    /// What they say, 0 to 1.
+    Numbers,
+}
+
+/// Reads and decodes an image.
+pub(super) fn read(document: &Document, image: &Image, meaning: Meaning) -> Result<Picture, Fault> {
     match (image.buffer_view, &image.uri) {
-        (Some(view), _) => decode(document.view(view)?),
-        (None, Some(uri)) => decode(&document.resource(uri)?),
+        (Some(view), _) => decode(document.view(view)?, meaning),
+        (None, Some(uri)) => decode(&document.resource(uri)?, meaning),
         (None, None) => Err("has neither a uri nor a bufferView".into()),
     }
 }
 
-fn decode(bytes: &[u8]) -> Result<Picture, Fault> {
+fn decode(bytes: &[u8], meaning: Meaning) -> Result<Picture, Fault> {
     let format = image::guess_format(bytes).ok();
     let Some(format) = format.filter(|f| [ImageFormat::Png, ImageFormat::Jpeg].contains(f)) else {
         return Err("is neither a PNG nor a JPEG".into());
@@ -48,11 +57,14 @@ fn decode(bytes: &[u8]) -> Result<Picture, Fault> {
     if width == 0 || height == 0 {
         return Err("has no texels".into());
     }
-    Ok(Picture { width, height, texels: linear(&image), has_alpha: has_alpha(&image) })
+    Ok(Picture { width, height, texels: linear(&image, meaning), has_alpha: has_alpha(&image) })
 }
 
 /// The texels, decoded with as many bits as the file has.
-fn linear(image: &DynamicImage) -> Vec<Rgb> {
+fn linear(image: &DynamicImage, meaning: Meaning) -> Vec<Rgb> {
+    if meaning == Meaning::Numbers {
+        return image.to_rgb32f().pixels().map(|p| p.0.into()).collect();
+    }
     if image.color().bytes_per_pixel() / image.color().channel_count() > 1 {
         let table = srgb_table(u16::MAX);
         return image.to_rgb16().pixels().map(|p| p.0.map(|v| table[usize::from(v)]).into()).collect();

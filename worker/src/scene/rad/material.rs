@@ -124,6 +124,8 @@ impl Matter {
             surface,
             emission: self.emission.as_vec3(),
             double_sided: self.reflection.is_some(),
+            bumps: None,
+            cached: true,
         }
     }
 }

@@ -82,7 +82,8 @@ fn unsupported_materials_are_refused_by_name() {
     let texture = json!({"index": 0});
     for (source, field) in [
         (json!({"pbrMetallicRoughness": {"metallicRoughnessTexture": texture}}), "metallicRoughnessTexture"),
-        (json!({"normalTexture": texture}), "normalTexture"),
+        (json!({"normalTexture": {"index": 7}}), "normalTexture: texture 7 does not exist"),
+        (json!({"extras": {"ambience_cached": 1}}), "extras.ambience_cached is 1; expected true or false"),
         (json!({"emissiveTexture": texture}), "emissiveTexture"),
         (json!({"extensions": {"KHR_materials_specular": {"specularTexture": texture}}}), "specularTexture"),
         (json!({"extensions": {"KHR_materials_specular": {"specularColorTexture": texture}}}), "specularColorTexture"),
@@ -204,4 +205,18 @@ fn broken_textures_are_refused() {
     ] {
         assert!(fault.contains(part), "{fault}");
     }
+}
+
+/// Numbers, not colours: half stays half.
+#[test]
+fn bumps_and_excluded_materials_are_read() {
+    let mut file = File::textured(&png(1, 1, &[128, 128, 255]), [0.0, 0.0]);
+    file.json["materials"][0] = json!({
+        "name": "paint", "normalTexture": {"index": 0, "scale": 0.5}, "extras": {"ambience_cached": false},
+    });
+    let scene = file.scene();
+    let bumps = scene.materials[0].bumps.expect("bumps");
+    assert_eq!((bumps.scale, scene.materials[0].texture, scene.materials[0].cached), (0.5, None, false));
+    let texel: Vec3 = scene.textures[bumps.texture as usize].texels[0];
+    assert!((texel - Vec3::new(128.0 / 255.0, 128.0 / 255.0, 1.0)).length() < 1e-6, "{texel}");
 }
