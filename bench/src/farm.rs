@@ -263,6 +263,20 @@ fn chart(name: &str, runs: &[Run]) -> Result<(), Box<dyn Error>> {
             "CPU seconds of the frame",
             vec![curve("server", &|run| run.server.cpu), curve("all workers' protocol", &|run| run.clients)],
         ),
+        (
+            "megabytes",
+            vec![
+                curve("server's peak memory", &|run| run.server.peak / 1e6),
+                curve("records to each worker", &|run| run.received / 1e6),
+            ],
+        ),
+        (
+            "work done twice, %",
+            vec![
+                curve("records", &|run| 100.0 * (run.made as f64 / run.done.records as f64 - 1.0)),
+                curve("leases lost", &|run| 100.0 * run.done.leases_lost as f64 / run.leases as f64),
+            ],
+        ),
     ];
     curves(name, &panels)
 }

@@ -23,7 +23,7 @@ use crate::replica::Added;
 use crate::store::{Counted, Keeping, Store};
 
 /// Most batches of one insert that wait to become durable.
-const UNDER_WAY_MAX: usize = 16;
+const UNDER_WAY_MAX: usize = 8;
 
 /// A subscriber that has everything hears of more after this long for each subscription the server has, so that many of
 /// them take half a core or less, and each message carries what came meanwhile.
