@@ -167,6 +167,18 @@ fn a_tiny_allowed_error_is_rendered() {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
+/// The floats round what it sees are farther apart than its pixels.
+#[test]
+fn a_camera_that_sees_next_to_nothing_is_rendered() {
+    let directory = tempfile::tempdir().expect("temporary directory");
+    let out = directory.path().join("out.exr").display().to_string();
+    let path = lit(directory.path());
+    scene(directory.path(), "lit.vf", &VIEW.replace("40", "1e-9"));
+    let args = ["render", &path, "-o", &out, "--size", "8x8", "--spp", "1", "--rays", "16", "--quiet"];
+    let output = ambience(&args);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
 /// A ball under an even sky, and its view beside it.
 fn lit(directory: &Path) -> String {
     scene(directory, "lit.vf", VIEW);

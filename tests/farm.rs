@@ -5,9 +5,10 @@
 mod processes;
 
 use std::path::PathBuf;
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Stdio};
 
 use processes::{alive, ambience, busy_worker, children, collect, render, signal, wait_for};
+use tempfile::TempDir;
 
 #[test]
 fn the_picture_does_not_depend_on_workers_threads_transport_or_run() {
@@ -85,30 +86,82 @@ fn children_end_even_when_render_is_killed() {
 /// The same parts by hand: a server, two workers, and two renders that use them one after the other.
 #[test]
 fn server_and_workers_started_by_hand_give_the_same_picture() {
-    let directory = tempfile::tempdir().expect("temporary directory");
-    let address = format!("unix:{}", directory.path().join("socket").display());
-    let start = |args: &[&str]| {
-        Command::new(env!("CARGO_BIN_EXE_ambience"))
-            .args(args)
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .stderr(Stdio::null())
-            .spawn()
-            .expect("ambience starts")
-    };
-    let mut server = start(&["serve", "--listen", &address]);
-    wait_for("the socket", || directory.path().join("socket").exists().then_some(()));
-    let mut workers: Vec<_> = (0..2).map(|_| start(&["worker", "--server", &address, "--threads", "1"])).collect();
-    let shared = render("cornell.glb", &["--server", &address]);
+    let farm = Farm::start(&[], 2);
+    let shared = render("cornell.glb", &["--server", &farm.address]);
     // A second frame on the same server finds every record it needs.
-    let again = render("cornell.glb", &["--server", &address]);
+    let again = render("cornell.glb", &["--server", &farm.address]);
     let alone = render("cornell.glb", &["--workers", "1"]);
-    for process in workers.iter_mut().chain([&mut server]) {
-        signal(process.id(), "TERM");
-        assert!(process.wait().expect("wait").success());
-    }
+    farm.end();
     assert_eq!(shared.stats["digest"], alone.stats["digest"]);
     assert!(shared.exr == alone.exr, "another picture");
     assert_eq!(again.stats["digest"], alone.stats["digest"], "the second frame added records");
     assert!(again.exr == alone.exr, "another picture from the records of the first");
+}
+
+/// What a server will never have room for is not asked for again and again, and the next who asks for less has it.
+#[test]
+fn a_permanent_bound_ends_the_frame_with_one_line() {
+    for (limit, line) in [
+        ("records=100", "no room for more records: this server keeps at most 100"),
+        ("namespaces=1", "no room for more namespaces: this server keeps at most 1"),
+    ] {
+        let farm = Farm::start(&["--limit", limit], 2);
+        let directory = tempfile::tempdir().expect("temporary directory");
+        let mut refused = ambience(directory.path(), "cornell.glb", &["--server", &farm.address]);
+        let mut refused = refused.stderr(Stdio::piped()).spawn().expect("ambience starts");
+        let status = wait_for("the render to give up", || refused.try_wait().expect("wait"));
+        let said = std::io::read_to_string(refused.stderr.take().expect("piped")).expect("text");
+        assert_eq!(status.code(), Some(1), "{limit}: {said}");
+        assert_eq!(said.lines().count(), 1, "{limit}: {said}");
+        assert!(said.starts_with("ambience: ") && said.contains(line), "{limit}: {said}");
+        assert!(!directory.path().join("out.exr").exists(), "{limit}: half a picture");
+
+        let path = ["--method", "path", "--server", &farm.address];
+        assert!(render("cornell.glb", &path).exr.len() > 1000, "{limit}");
+        farm.end();
+    }
+}
+
+/// A server and workers of one thread, started by hand.
+struct Farm {
+    address: String,
+    workers: Vec<Child>,
+    server: Child,
+    _directory: TempDir,
+}
+
+impl Farm {
+    fn start(options: &[&str], workers: u32) -> Self {
+        let directory = tempfile::tempdir().expect("temporary directory");
+        let socket = directory.path().join("socket");
+        let address = format!("unix:{}", socket.display());
+        let start = |args: &[&str]| {
+            let mut command = Command::new(env!("CARGO_BIN_EXE_ambience"));
+            command.args(args).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+            command.spawn().expect("ambience starts")
+        };
+        let server = start(&[&["serve", "--listen", &address], options].concat());
+        wait_for("the socket", || socket.exists().then_some(()));
+        let worker = |_| start(&["worker", "--server", &address, "--threads", "1"]);
+        let workers = (0..workers).map(worker).collect();
+        Self { workers, server, address, _directory: directory }
+    }
+
+    /// Ends it in good order.
+    fn end(mut self) {
+        for process in self.workers.iter_mut().chain([&mut self.server]) {
+            signal(process.id(), "TERM");
+            assert!(process.wait().expect("wait").success());
+        }
+    }
+}
+
+/// Nothing is left running by a test that failed.
+impl Drop for Farm {
+    fn drop(&mut self) {
+        for process in self.workers.iter_mut().chain([&mut self.server]) {
+            // It may have ended.
+            drop(process.kill());
+        }
+    }
 }

@@ -33,12 +33,11 @@ pub struct FarmArgs {
     /// Sizes of the farms
     #[arg(default_values_t = [1, 8, 64, 256, 1024])]
     workers: Vec<u32>,
-    /// Mean time of one gather, microseconds for each worker of the farm: all take about as long, and the service is
-    /// asked for the same each second
-    #[arg(long, default_value_t = 1000)]
+    /// Mean time of one gather, microseconds
+    #[arg(long, default_value_t = 16000)]
     gather: u32,
     /// Width of the picture; its height is 9/16 of that
-    #[arg(long, default_value_t = 1920)]
+    #[arg(long, default_value_t = 960)]
     width: u32,
     /// Keep table and chart in bench/results, under this name
     #[arg(long, value_name = "NAME")]
@@ -155,7 +154,7 @@ fn frame(args: &FarmArgs, workers: u32) -> Result<Run, Box<dyn Error>> {
     // One thread for the protocol, few for keeping records: the machine is the server's, too.
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(1).max_blocking_threads(2).enable_all().build()?;
-    watch().gather.store(u64::from(args.gather) * u64::from(workers), Ordering::Relaxed);
+    watch().gather.store(args.gather.into(), Ordering::Relaxed);
     let spec = work::spec(args.width, args.width * 9 / 16);
     let (over, visible) = look();
     let result = runtime.block_on(async {
@@ -262,6 +261,20 @@ fn chart(name: &str, runs: &[Run]) -> Result<(), Box<dyn Error>> {
         (
             "CPU seconds of the frame",
             vec![curve("server", &|run| run.server.cpu), curve("all workers' protocol", &|run| run.clients)],
+        ),
+        (
+            "megabytes",
+            vec![
+                curve("server's peak memory", &|run| run.server.peak / 1e6),
+                curve("records to each worker", &|run| run.received / 1e6),
+            ],
+        ),
+        (
+            "work done twice, %",
+            vec![
+                curve("records", &|run| 100.0 * (run.made as f64 / run.done.records as f64 - 1.0)),
+                curve("leases lost", &|run| 100.0 * run.done.leases_lost as f64 / run.leases as f64),
+            ],
         ),
     ];
     curves(name, &panels)

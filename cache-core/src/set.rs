@@ -9,6 +9,9 @@ use hashbrown::hash_table::{Entry, HashTable};
 use crate::id::{Digest, RecordId};
 use crate::record::Record;
 
+/// Records looked up together before they are placed: each look-up waits for memory, but none for another.
+const TOGETHER: usize = 64;
+
 /// What a set knows of a record besides its content.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 pub struct Tag {
@@ -120,20 +123,37 @@ fn spread(hash: u32) -> u64 {
 impl RecordSet {
     /// Unites with one record.
     pub fn insert(&mut self, tag: Tag, record: impl Into<Record>) -> Inserted {
-        let record = record.into();
+        self.place(tag, &record.into())
+    }
+
+    /// Unites with records of one tag: the same as [`Self::insert`] of one after the other, in less time. Which of them took
+    /// the place of other contents.
+    pub fn extend(&mut self, tag: Tag, records: &[Record]) -> Vec<RecordId> {
+        let mut replaced = Vec::new();
+        for some in records.chunks(TOGETHER) {
+            self.index.slots.reserve(some.len(), |slot| spread(slot.hash));
+            let known = some.iter().filter(|record| self.position_of(record.id()).is_some()).count();
+            self.log.reserve(some.len() - known);
+            let took = |record: &&Record| self.place(tag, record) == Inserted::Replaced;
+            replaced.extend(some.iter().filter(took).map(Record::id));
+        }
+        replaced
+    }
+
+    fn place(&mut self, tag: Tag, record: &Record) -> Inserted {
         let id = record.id();
         let (new, slot) = self.index.entry(&self.log, id);
         let mut slot = match slot {
             Entry::Vacant(slot) => {
                 slot.insert(new);
                 self.steps.entry(tag.step).or_default().add(id);
-                self.log.push((tag, record));
+                self.log.push((tag, *record));
                 return Inserted::Added;
             }
             Entry::Occupied(slot) => slot,
         };
         let (known, held) = &self.log[slot.get().at as usize];
-        let order = (tag, bytes(&record)).cmp(&(*known, bytes(held)));
+        let order = (tag, bytes(record)).cmp(&(*known, bytes(held)));
         if order.is_ne() {
             self.conflicts += 1;
         }
@@ -146,7 +166,7 @@ impl RecordSet {
         self.steps.entry(tag.step).or_default().add(id);
         *slot.get_mut() = new;
         self.replaced.insert(new.at as usize);
-        self.log.push((tag, record));
+        self.log.push((tag, *record));
         Inserted::Replaced
     }
 
@@ -300,6 +320,22 @@ mod tests {
             let (ab, bc) = (union(&[&a, &b]), union(&[&b, &c]));
             let held = |s: &RecordSet| s.level(1).filter_map(shrink).collect::<Vec<_>>();
             prop_assert_eq!(content(&union(&[&held(&ab), &c])), content(&union(&[&a, &held(&bc)])));
+        }
+
+        #[test]
+        fn extending_is_inserting_one_after_the_other(parts in prop::collection::vec((0..3u32, records()), 0..6)) {
+            let (mut at_once, mut singly) = (RecordSet::default(), RecordSet::default());
+            for (step, part) in &parts {
+                let tag = Tag { level: 1, step: *step };
+                // More than are looked up together.
+                let part: Vec<_> = part.iter().cycle().take(3 * part.len()).map(|r| Record::from(*r)).collect();
+                let took = part.iter().filter(|r| singly.insert(tag, **r) == Inserted::Replaced).map(Record::id);
+                let took: Vec<_> = took.collect();
+                prop_assert_eq!(at_once.extend(tag, &part), took);
+            }
+            prop_assert_eq!(at_once.since(0), singly.since(0));
+            prop_assert_eq!((at_once.sum(), at_once.before(1)), (singly.sum(), singly.before(1)));
+            prop_assert_eq!((at_once.conflicts(), at_once.replaced()), (singly.conflicts(), singly.replaced()));
         }
 
         #[test]

@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::ops::Range;
 
 use cache_core::id::Digest;
-use cache_core::set::{Inserted, Sum};
+use cache_core::set::Sum;
 use cache_core::{Namespace, Record, RecordSet, Tag};
 use cache_proto::convert::{self, BATCH_RECORDS_MAX, Checked};
 use cache_proto::v1;
@@ -141,13 +141,8 @@ impl Replica {
     fn unite(&mut self, namespace: Namespace, tag: Tag, records: &[Record]) -> Added {
         let set = &mut self.kept.entry(namespace).or_default().set;
         let (before, known) = (set.position(), set.len());
-        for record in records {
-            if set.insert(tag, *record) == Inserted::Replaced {
-                tracing::warn!(
-                    id = format_args!("{:032x}", { record.id().0 }),
-                    "a record came twice with different content"
-                );
-            }
+        for id in set.extend(tag, records) {
+            tracing::warn!(id = format_args!("{:032x}", { id.0 }), "a record came twice with different content");
         }
         self.held += set.position() - before;
         Added { added: (set.len() - known) as u64, position: set.position() as u64 }

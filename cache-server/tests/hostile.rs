@@ -245,6 +245,7 @@ async fn records_that_are_none() {
         ("normal", spoil(|r| r.normal *= 2.0)),
         ("radius", spoil(|r| r.radius = 0.0)),
         ("radius", spoil(|r| r.radius = -f32::from_bits(1))),
+        ("radius", spoil(|r| (r.radius, r.radius_min) = (1e-30, 1e-30))),
         ("radius", spoil(|r| r.radius_max = f32::NAN)),
         ("gradient", spoil(|r| r.gradient_t[1].x = f32::NEG_INFINITY)),
     ];

@@ -141,7 +141,17 @@ async fn metrics_tell_what_happened() {
         }
     };
     let shown = tokio::time::timeout(support::PATIENCE, shown).await;
-    assert!(shown.is_ok(), "{}", metrics(&free));
+    let text = metrics(&free);
+    assert!(shown.is_ok(), "{text}");
+    // Prometheus' own rules: base units, and `_total` for what only grows.
+    let types: Vec<_> = text.lines().filter_map(|line| line.strip_prefix("# TYPE ")?.split_once(' ')).collect();
+    assert!(types.len() > 10, "{text}");
+    for (name, kind) in types {
+        assert_eq!(name.ends_with("_total"), kind == "counter", "{name} is a {kind}");
+        assert!(kind != "histogram" || name.ends_with("_seconds"), "{name} is a {kind}");
+        let units = ["micros", "millis", "minutes", "kilo", "mega", "percent"];
+        assert!(name.starts_with("ambience_") && !units.iter().any(|unit| name.contains(unit)), "{name}");
+    }
     server.kill().expect("running");
     server.wait().expect("ended");
 }

@@ -5,10 +5,6 @@ use glam::Vec3;
 
 const RECORDS_MAX: usize = 48;
 
-/// Where a record reaches less far than some spacings of floats as large as the whole set, the octree may lose it between
-/// cells, in one order and not in another; those are not asked.
-const RESOLVED: f32 = 4e-6;
-
 /// A record that decodes is sound and encodes to the same bytes. Sealed caches answer at the site of each record, and the
 /// same however they were made, whatever is proposed for their records: the first byte of its noise says what.
 pub fn record(data: &[u8]) {
@@ -41,10 +37,7 @@ pub fn record(data: &[u8]) {
         for record in sound.values().rev() {
             one_by_one.extend([*record]);
         }
-        let counts = |record: &Irradiance| a * record.radius.min(record.radius_max).max(record.radius_min);
-        let far = |record: &Irradiance| record.position.abs().max_element() + counts(record);
-        let extent = sound.values().map(far).fold(0.0, f32::max);
-        for record in sound.values().filter(|record| counts(record) > RESOLVED * extent) {
+        for record in sound.values() {
             let site = Query::new(record.position, record.normal);
             assert!(at_once.covers(&site), "{record:?}");
             let beside = Query { position: record.position + Vec3::splat(record.radius * a * 0.3), ..site };

@@ -47,6 +47,14 @@ pub enum Malformed {
         /// What would have been right.
         most: usize,
     },
+    /// A number that is none, or without end.
+    #[error("{field} is {got}, expected a finite number")]
+    Number {
+        /// Which.
+        field: &'static str,
+        /// What it was.
+        got: f32,
+    },
     /// More records than one batch may carry.
     #[error("batch has {0} bytes of records, expected at most 4096 records")]
     TooMany(usize),
@@ -165,6 +173,11 @@ pub fn entry(entry: &v1::Entry) -> Result<Checked, Malformed> {
             if label.scene_hash.len() > 32 {
                 return Err(Malformed::Long { field: "scene_hash", got: label.scene_hash.len(), most: 32 });
             }
+            for (field, got) in [("a", label.a), ("rays_by_deviation", label.rays_by_deviation)] {
+                if !got.is_finite() {
+                    return Err(Malformed::Number { field, got });
+                }
+            }
             let draft_of = (!label.draft_of.is_empty()).then(|| namespace(&label.draft_of)).transpose()?;
             Ok(Checked::Label(namespace(&label.namespace)?, draft_of, label.clone()))
         }
@@ -239,6 +252,18 @@ mod tests {
         assert!(
             message(&v1::RecordBatch { namespace: vec![1].into(), ..batch(vec![]) }).contains("namespace has 1 bytes")
         );
+    }
+
+    /// It would not equal itself, and no line of JSON can hold it.
+    #[test]
+    fn a_label_has_no_number_that_is_none() {
+        let label = |a, rays_by_deviation| {
+            let label = v1::Label { namespace: vec![0; 32].into(), a, rays_by_deviation, ..Default::default() };
+            entry(&v1::Entry { entry: Some(v1::entry::Entry::Label(label)) }).map(drop).map_err(|e| e.to_string())
+        };
+        assert_eq!(label(0.3, 0.0), Ok(()));
+        assert_eq!(label(f32::NAN, 0.0), Err("a is NaN, expected a finite number".into()));
+        assert_eq!(label(0.3, f32::INFINITY), Err("rays_by_deviation is inf, expected a finite number".into()));
     }
 
     #[test]

@@ -341,8 +341,10 @@ impl Frame {
                     Spacing::World => REACH_MIN_WORLD[deeper] * self.world.radius,
                     Spacing::Free => f32::MIN_POSITIVE,
                 };
-                // From far away, or with a tiny `a`, everything is nearer than that.
-                let radius_min = (reach / s.a).clamp(f32::MIN_POSITIVE, 4.0 * self.world.radius);
+                // From far away, or with a tiny `a`, everything is nearer than that; floats round the site are farther apart
+                // than pixels of a camera that sees next to nothing.
+                let spacing = at.position.abs().max_element() * f32::EPSILON;
+                let radius_min = (reach / s.a).min(4.0 * self.world.radius).max(spacing).max(f32::MIN_POSITIVE);
                 let radius_max = match s.details.spacing {
                     Spacing::Pixels => radius_min * REACH_RATIO,
                     Spacing::World | Spacing::Free => 4.0 * self.world.radius,

@@ -24,6 +24,8 @@ pub(super) struct Device {
     sync: Sync,
     #[cfg(test)]
     room: tests::Room,
+    #[cfg(test)]
+    unsynced: Option<tests::Unsynced>,
 }
 
 impl Device {
@@ -33,6 +35,8 @@ impl Device {
             sync,
             #[cfg(test)]
             room: tests::ROOM.with_borrow(Clone::clone),
+            #[cfg(test)]
+            unsynced: tests::UNSYNCED.with_borrow(Clone::clone),
         }
     }
 }
@@ -47,12 +51,18 @@ impl redb::StorageBackend for Device {
     }
 
     fn set_len(&self, len: u64) -> io::Result<()> {
+        #[cfg(test)]
+        self.unsynced.iter().try_for_each(|unsynced| unsynced.changes(&self.file, len, 0))?;
         self.file.set_len(len)
     }
 
     fn sync_data(&self) -> io::Result<()> {
         match self.sync {
-            Sync::Device => self.file.sync_data(),
+            Sync::Device => {
+                #[cfg(test)]
+                self.unsynced.iter().try_for_each(|unsynced| unsynced.synced(&self.file))?;
+                self.file.sync_data()
+            }
             Sync::PageCache => Ok(()),
         }
     }
@@ -60,8 +70,10 @@ impl redb::StorageBackend for Device {
     fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {
         #[cfg(test)]
         tests::take(&self.room, data.len())?;
-        let used = data.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1);
-        let used = used.next_multiple_of(BLOCK).min(data.len());
+        #[cfg(test)]
+        self.unsynced.iter().try_for_each(|unsynced| unsynced.changes(&self.file, offset, data.len()))?;
+        let zeros = data.rchunks(BLOCK).take_while(|block| block.iter().fold(0, |all, byte| all | byte) == 0);
+        let used = data.len() - zeros.map(<[u8]>::len).sum::<usize>();
         if used < data.len() && self.is_hole(offset + used as u64, (data.len() - used) as u64) {
             return self.file.write_all_at(&data[..used], offset);
         }
@@ -94,9 +106,11 @@ impl Device {
 #[cfg(test)]
 pub(super) mod tests {
     use std::cell::RefCell;
+    use std::fs::File;
     use std::io;
-    use std::sync::Arc;
+    use std::os::unix::fs::FileExt as _;
     use std::sync::atomic::{AtomicUsize, Ordering};
+    use std::sync::{Arc, Mutex};
 
     /// Bytes that can still be written before the disk is full.
     pub(crate) type Room = Arc<AtomicUsize>;
@@ -104,11 +118,88 @@ pub(super) mod tests {
     thread_local! {
         /// The room on the disk of devices this thread opens.
         pub(crate) static ROOM: RefCell<Room> = RefCell::new(Arc::new(AtomicUsize::new(usize::MAX)));
+
+        /// What is noted of devices this thread opens, if anything is.
+        pub(crate) static UNSYNCED: RefCell<Option<Unsynced>> = const { RefCell::new(None) };
     }
 
     pub(super) fn take(room: &Room, bytes: usize) -> io::Result<()> {
         let less = |room: usize| if room == usize::MAX { Some(room) } else { room.checked_sub(bytes) };
         let taken = room.fetch_update(Ordering::Relaxed, Ordering::Relaxed, less);
         taken.map(drop).map_err(|_| io::ErrorKind::StorageFull.into())
+    }
+
+    /// What a power cut may undo: changes the device was not waited for after.
+    #[derive(Clone, Default, Debug)]
+    pub(crate) struct Unsynced(Arc<Mutex<Noted>>);
+
+    #[derive(Default, Debug)]
+    struct Noted {
+        since: Vec<Undo>,
+        moments: Vec<Moment>,
+    }
+
+    /// The file's length, and some of its bytes, before a change.
+    #[derive(Clone, Debug)]
+    struct Undo {
+        length: u64,
+        offset: u64,
+        bytes: Vec<u8>,
+    }
+
+    /// A file as its process sees it, and what of it may not be on the device.
+    #[derive(Debug)]
+    pub(crate) struct Moment {
+        file: Vec<u8>,
+        unsynced: Vec<Undo>,
+    }
+
+    impl Unsynced {
+        /// Bytes from `offset` on are about to change: `count` of them, or all behind if the length does.
+        pub(super) fn changes(&self, file: &File, offset: u64, count: usize) -> io::Result<()> {
+            let length = file.metadata()?.len();
+            let behind = length.saturating_sub(offset) as usize;
+            let mut bytes = vec![0; if count == 0 { behind } else { count.min(behind) }];
+            file.read_exact_at(&mut bytes, offset)?;
+            self.0.lock().expect("no panic").since.push(Undo { length, offset, bytes });
+            Ok(())
+        }
+
+        /// The device is about to be waited for.
+        pub(super) fn synced(&self, file: &File) -> io::Result<()> {
+            let moment = self.moment(file)?;
+            let mut noted = self.0.lock().expect("no panic");
+            noted.moments.push(moment);
+            noted.since.clear();
+            Ok(())
+        }
+
+        /// As it is now.
+        pub(crate) fn moment(&self, file: &File) -> io::Result<Moment> {
+            let mut bytes = vec![0; file.metadata()?.len() as usize];
+            file.read_exact_at(&mut bytes, 0)?;
+            Ok(Moment { file: bytes, unsynced: self.0.lock().expect("no panic").since.clone() })
+        }
+
+        /// Just before each wait for the device since the last call.
+        pub(crate) fn take(&self) -> Vec<Moment> {
+            std::mem::take(&mut self.0.lock().expect("no panic").moments)
+        }
+    }
+
+    impl Moment {
+        /// What is left of it when the power is cut: each change that was not waited for is there or not, as `kept` says.
+        pub(crate) fn cut(&self, mut kept: impl FnMut() -> bool) -> Vec<u8> {
+            let mut file = self.file.clone();
+            for Undo { length, offset, bytes } in self.unsynced.iter().rev().filter(|_| !kept()) {
+                let end = *offset as usize + bytes.len();
+                file.resize(file.len().max(end), 0);
+                file[*offset as usize..end].copy_from_slice(bytes);
+                if end as u64 == *length {
+                    file.truncate(end);
+                }
+            }
+            file
+        }
     }
 }

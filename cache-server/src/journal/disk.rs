@@ -21,8 +21,9 @@ pub const FILE: &str = "journal.redb";
 /// Name of the file whose lock says that a process uses the directory.
 pub(super) const LOCK: &str = "journal.lock";
 
-/// Memory redb may keep pages in, bytes. A journal is read once.
-const CACHE_BYTES: usize = 32 << 20;
+/// Memory redb may keep pages in, bytes: a few of the largest values that are usual. A journal is read once, and pages
+/// kept after they are written are memory that the next do not use again.
+const CACHE_BYTES: usize = 16 << 20;
 
 /// Sealed appends by their sequence number.
 const VALUES: TableDefinition<u64, &[u8]> = TableDefinition::new("values");

@@ -214,6 +214,44 @@ fn after_a_crash_every_append_is_there() {
     }
 }
 
+/// The power is cut at any moment of an append, and what the kernel had not yet brought to the device is lost, any part of
+/// it: what was acknowledged before is there, and nothing that was not appended.
+#[test]
+fn after_a_power_cut_every_acknowledged_append_is_there() {
+    let unsynced = device::Unsynced::default();
+    device::UNSYNCED.set(Some(unsynced.clone()));
+    let directory = tempfile::tempdir().expect("a directory");
+    let (mut disk, _) = Disk::open(directory.path(), Sync::Device).expect("a journal");
+    device::UNSYNCED.set(None);
+    unsynced.take();
+    let mut random = 1u64;
+    let mut coin = || {
+        random = random.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        random >> 63 == 0
+    };
+    let (mut kept, mut undone) = (Vec::new(), 0);
+    for append in appends() {
+        disk.append(&append).expect("room");
+        let more = [kept.clone(), append].concat();
+        let file = fs::File::open(directory.path().join(FILE)).expect("there");
+        let during = unsynced.take();
+        assert!(!during.is_empty(), "nobody waited for the device");
+        let now = unsynced.moment(&file).expect("readable");
+        for (moment, acknowledged) in during.iter().map(|moment| (moment, &kept)).chain([(&now, &more)]) {
+            for _ in 0..4 {
+                let left = tempfile::tempdir().expect("a directory");
+                fs::write(left.path().join(FILE), moment.cut(&mut coin)).expect("written");
+                let (mut disk, report) = open(left.path());
+                let held = held(&mut disk);
+                assert!(held == *acknowledged || held == more, "{report:?}, {} acknowledged", acknowledged.len());
+                undone += usize::from(held.len() < more.len());
+            }
+        }
+        kept = more;
+    }
+    assert!(undone > 10, "no cut undid anything: {undone}");
+}
+
 #[test]
 fn one_process_at_a_time() {
     let directory = tempfile::tempdir().expect("a directory");

@@ -229,14 +229,15 @@ impl Reader {
     /// Reads an included file. As xform does, names are taken relative to the file that has them; failing that, to the
     /// outermost file and to the directory the program runs in.
     fn find(&self, name: &[u8], outer: &Source) -> Result<Source, String> {
-        let name = std::str::from_utf8(name).map_err(|_| format!("file name `{}` is not UTF-8", show(name)))?;
+        let shown = show(name);
+        let name = std::str::from_utf8(name).map_err(|_| format!("file name `{shown}` is not UTF-8"))?;
         let places = [outer.directory().join(name), self.home.join(name), PathBuf::from(name)];
         let path = places
             .iter()
             .find(|p| p.is_file())
-            .ok_or_else(|| format!("file `{}` is not found; expected it in {}", name, outer.directory().display()))?;
+            .ok_or_else(|| format!("file `{shown}` is not found; expected it in {}", outer.directory().display()))?;
         if self.open.contains(&identity(path)) {
-            return Err(format!("file `{}` includes itself; expected no circle", path.display()));
+            return Err(format!("file `{shown}` includes itself; expected no circle"));
         }
         if self.open.len() >= MAX_DEPTH {
             return Err(format!("files are nested deeper than {MAX_DEPTH}; expected fewer levels"));

@@ -339,10 +339,12 @@ fn errors_name_file_line_and_object() {
         ("!xform -t 1 1 1\n", "no file to read"),
         ("!xform -a 1000000000 main.rad\n", "too many copies"),
         ("!xform nowhere.rad\n", "main.rad:1: command `xform nowhere.rad`: file `nowhere.rad` is not found"),
+        ("!xform no\u{5}where.rad\n", "file `no\u{fffd}where.rad` is not found"),
         ("!xform main.rad\n", "includes itself"),
     ] {
         let message = error(text);
         assert!(message.starts_with("main.rad") && message.contains(wanted), "{text:?} gives {message:?}");
+        assert!(!message.contains(char::is_control), "{text:?} gives {message:?}");
     }
     for (kind, reals, wanted) in [
         ("sphere", "0 0 0 -1", "main.rad:5: sphere it: radius is -1"),

@@ -210,7 +210,7 @@ fn broken_textures_are_refused() {
 /// Numbers, not colours: half stays half.
 #[test]
 fn bumps_and_excluded_materials_are_read() {
-    let mut file = File::textured(&png(1, 1, &[128, 128, 255]), [0.0, 0.0]);
+    let mut file = File::textured(&png(1, 1, &[128, 128, 255, 255]), [0.0, 0.0]);
     file.json["materials"][0] = json!({
         "name": "paint", "normalTexture": {"index": 0, "scale": 0.5}, "extras": {"ambience_cached": false},
     });
