@@ -212,6 +212,8 @@ fn room() -> Scene {
         surface: Surface::Diffuse,
         emission,
         double_sided: true,
+        bumps: None,
+        cached: true,
     };
     let triangle = |positions, material| Triangle { positions, normals: None, uvs: [Vec2::ZERO; 3], material };
     let room = || Scene {

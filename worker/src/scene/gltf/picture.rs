@@ -102,7 +102,7 @@ mod tests {
     #[test]
     fn anything_but_png_and_jpeg_is_refused() {
         for bytes in [&b""[..], b"GIF89a", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0"] {
-            assert!(decode(bytes).is_err());
+            assert!(decode(bytes, Meaning::Colors).is_err());
         }
     }
 }
