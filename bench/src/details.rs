@@ -1,6 +1,7 @@
 //! What each practical detail of irradiance caching buys: error and records with one choice changed at a time.
 
 use std::error::Error;
+use std::path::{Path, PathBuf};
 
 use cache_core::details::{Details, Distance, Gradients, Metric, Spacing, Weighting};
 use cache_core::rounds::RANKS;
@@ -29,6 +30,9 @@ pub struct DetailsArgs {
     /// Samples a pixel
     #[arg(long, default_value_t = 64)]
     spp: u32,
+    /// In place of the table: for each detail the place where a picture without it errs most, into this folder
+    #[arg(long, value_name = "DIR")]
+    pictures: Option<PathBuf>,
 }
 
 /// Prints one line for every choice and allowed error.
@@ -36,6 +40,9 @@ pub struct DetailsArgs {
 /// # Errors
 /// Names that are no SCENE.DEPTH.
 pub fn run(args: &DetailsArgs) -> Result<(), Box<dyn Error>> {
+    if let Some(folder) = &args.pictures {
+        return pictures(args, folder);
+    }
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
     println!(
         "{SIZE}x{SIZE}, --rays {} --spp {}; records of level 1, of all; CPU seconds of the fill; RMSE, bias, worst block; passes, \
@@ -60,9 +67,7 @@ pub fn run(args: &DetailsArgs) -> Result<(), Box<dyn Error>> {
                     let pixels = solo::pixels(&frame, &filled.levels).0;
                     (filled, pixels, seconds)
                 });
-                let image: Vec<_> =
-                    pixels.chunks_exact(CHANNELS).map(|p| [p[0].into(), p[1].into(), p[2].into()]).collect();
-                let v = judge(&image, &truth);
+                let v = judge(&image(&pixels), &truth);
                 let first = filled.levels.first().map_or(0, |l| l.len());
                 let all: usize = filled.levels.iter().map(|l| l.len()).sum();
                 let testing = 100.0 * filled.counts.test_seconds / seconds;
@@ -79,6 +84,85 @@ pub fn run(args: &DetailsArgs) -> Result<(), Box<dyn Error>> {
         }
     }
     Ok(())
+}
+
+fn image(pixels: &[f32]) -> Vec<[f64; 3]> {
+    pixels.chunks_exact(CHANNELS).map(|p| [p[0].into(), p[1].into(), p[2].into()]).collect()
+}
+
+/// Where each detail shows: the scene that breaks without it, the allowed error there, and what is done without it.
+fn shown() -> Vec<(&'static str, &'static str, f32, Details)> {
+    let usual = Details::default();
+    vec![
+        ("metric", "stairs.full", 0.4, Details { metric: Metric::SplitSphere, ..usual }),
+        ("neighbor-clamping", "stairs.full", 0.4, Details { neighbor_clamping: false, ..usual }),
+        ("translational-gradient", "cornell.full", 0.4, Details { gradients: Gradients::None, ..usual }),
+        ("rotational-gradient", "sphere-plane.full", 0.4, Details { rotation: false, ..usual }),
+        ("gradients-per-channel", "cornell.full", 0.4, Details { gradients_per_channel: false, ..usual }),
+        ("radius-by-gradient", "cornell.full", 0.4, Details { radius_by_gradient: false, ..usual }),
+        ("gradient-by-radius", "stairs.full", 0.2, Details { gradient_by_radius: false, ..usual }),
+        ("weights", "cornell.full", 0.4, Details { weighting: Weighting::Inverse, ..usual }),
+        ("distance", "leak.full", 0.4, Details { distance: Distance::Nearest, ..usual }),
+        ("spacing", "stairs.full", 0.2, Details { spacing: Spacing::World, ..usual }),
+    ]
+}
+
+/// One picture for each detail, DIR/NAME.png: reference, with it, without it, where the last errs most; and a line.
+fn pictures(args: &DetailsArgs, folder: &Path) -> Result<(), Box<dyn Error>> {
+    std::fs::create_dir_all(folder)?;
+    println!("128x128, --rays {} --spp {}; with -> without: records of level 1, RMSE, worst block", args.rays, args.spp);
+    for (name, scene, a, without) in shown() {
+        if args.only.as_ref().is_some_and(|only| !name.contains(only.as_str())) {
+            continue;
+        }
+        let (file, depth) = scene.split_once('.').ok_or("expected SCENE.DEPTH")?;
+        let truth = reference(scene);
+        let render = |details: Details| {
+            let (scene, camera) = load(&format!("{file}.glb"));
+            let base = settings(camera, depth);
+            let frame = Frame::new(scene, Settings { a, rays: args.rays, spp: args.spp, details, ..base });
+            let levels = solo::fill(&frame, Order::Rounds);
+            let image = image(&solo::pixels(&frame, &levels).0);
+            let verdict = judge(&image, &truth);
+            (image, levels.first().map_or(0, |level| level.len()), verdict)
+        };
+        let (with, without) = (render(Details::default()), render(without));
+        let percent = |v: f64| 100.0 * v;
+        println!(
+            "{name:24} {scene:18} a {a} {:6} -> {:6}  {:5.2} % -> {:5.2} %  {:5.2} % -> {:5.2} %",
+            with.1,
+            without.1,
+            percent(with.2.rmse),
+            percent(without.2.rmse),
+            percent(with.2.worst),
+            percent(without.2.worst),
+        );
+        let place = without.2.place.map(|at| at.saturating_sub(CROP / 2 - 4).min(SIZE - CROP));
+        let strip = strip(&[&truth.image, &with.0, &without.0], place);
+        strip.save(folder.join(format!("{name}.png")))?;
+    }
+    Ok(())
+}
+
+/// Edge of what is shown of a picture, and how much it is enlarged.
+const CROP: usize = 48;
+const ENLARGED: usize = 4;
+
+/// The same place of several pictures side by side, in sRGB, as bright as the first one's brightest there allow.
+fn strip(pictures: &[&Vec<[f64; 3]>], [left, top]: [usize; 2]) -> image::RgbImage {
+    let at = |picture: &[[f64; 3]], x: usize, y: usize| picture[(top + y) * SIZE + left + x];
+    let mut bright: Vec<f64> =
+        (0..CROP * CROP).flat_map(|i| at(pictures[0], i % CROP, i / CROP)).collect();
+    bright.sort_by(f64::total_cmp);
+    let exposure = 0.9 / bright[bright.len() * 98 / 100];
+    let gap = CROP * ENLARGED + 8;
+    image::RgbImage::from_fn((gap * pictures.len() - 8) as u32, (CROP * ENLARGED) as u32, |x, y| {
+        let (which, x, y) = (x as usize / gap, x as usize % gap / ENLARGED, y as usize / ENLARGED);
+        if x >= CROP {
+            return image::Rgb([255; 3]);
+        }
+        image::Rgb(at(pictures[which], x, y).map(|v| worker::film::srgb((v * exposure) as f32)))
+    })
 }
 
 /// The default, and the default with one thing changed.

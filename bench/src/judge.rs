@@ -94,6 +94,8 @@ pub struct Verdict {
     pub bias: f64,
     /// Largest difference of an 8 x 8 block's mean.
     pub worst: f64,
+    /// Left and top of that block.
+    pub place: [usize; 2],
 }
 
 /// Judges a picture; pixels that see a lamp, and their neighbours, are left out: how edges of lamps are covered says
@@ -106,7 +108,7 @@ pub fn judge(image: &[[f64; 3]], reference: &Reference) -> Verdict {
     let squares: f64 =
         cold.iter().flat_map(|&i| (0..3).map(move |c| (image[i][c] - reference.image[i][c]).powi(2))).sum();
     let noise: f64 = cold.iter().map(|&i| reference.error[i].powi(2)).sum::<f64>() / cold.len() as f64;
-    let mut worst = 0f64;
+    let (mut worst, mut place) = (0f64, [0; 2]);
     for block in 0..(SIZE / 8).pow(2) {
         let (x0, y0) = (block % (SIZE / 8) * 8, block / (SIZE / 8) * 8);
         let inside: Vec<usize> = (0..64).map(|k| (y0 + k / 8) * SIZE + x0 + k % 8).filter(|i| !hot[*i]).collect();
@@ -114,13 +116,17 @@ pub fn judge(image: &[[f64; 3]], reference: &Reference) -> Verdict {
             let sums = inside.iter().fold([0.0; 3], |sums: [f64; 3], &i| {
                 std::array::from_fn(|c| sums[c] + image[i][c] - reference.image[i][c])
             });
-            worst = sums.map(|sum| (sum / inside.len() as f64).abs()).into_iter().fold(worst, f64::max);
+            let apart = sums.map(|sum| (sum / inside.len() as f64).abs()).into_iter().fold(0.0, f64::max);
+            if apart > worst {
+                (worst, place) = (apart, [x0, y0]);
+            }
         }
     }
     Verdict {
         rmse: (squares / (3 * cold.len()) as f64 - noise).max(0.0).sqrt() / scale,
         bias: mean(image) / scale - 1.0,
         worst: worst / scale,
+        place,
     }
 }
 

@@ -6,6 +6,7 @@
 //! - [`details`]: what each practical detail of irradiance caching buys.
 //! - [`soups`]: rooms of many triangles, and rays in them.
 //! - [`rays`]: rays a second, against Embree.
+//! - [`lookups`]: look-ups a second, against an octree of pointers.
 //! - [`records`]: records made up, of real size.
 //! - [`bare`]: the cache service with nothing behind it.
 //! - [`host`]: a server in a process of its own.
@@ -19,6 +20,7 @@ pub mod details;
 pub mod judge;
 pub mod pictures;
 
+pub mod lookups;
 pub mod rays;
 pub mod soups;
 

@@ -3,7 +3,7 @@
 use std::error::Error;
 
 use ambience_bench::host::HostArgs;
-use ambience_bench::{asked, details, farm, host, pictures, rays, service};
+use ambience_bench::{asked, details, farm, host, lookups, pictures, rays, service};
 use clap::{Parser, Subcommand};
 
 /// Speed against accuracy: every method at several settings, on the scenes with references.
@@ -25,6 +25,8 @@ enum Command {
     Asked(asked::AskedArgs),
     /// Rays a second, against Embree
     Rays(rays::RaysArgs),
+    /// Look-ups a second, against an octree of pointers
+    Lookups(lookups::LookupsArgs),
     /// The cache service against the bare stream under it
     Service(service::ServiceArgs),
     /// One frame by simulated farms of many sizes
@@ -41,6 +43,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         Some(Command::Details(args)) => details::run(&args),
         Some(Command::Asked(args)) => asked::run(&args),
         Some(Command::Rays(args)) => rays::run(&args),
+        Some(Command::Lookups(args)) => lookups::run(&args),
         Some(Command::Service(args)) => service::run(&args),
         Some(Command::Farm(args)) => farm::run(&args),
         Some(Command::Host(args)) => host::serve(&args),

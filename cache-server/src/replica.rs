@@ -48,6 +48,13 @@ struct Kept {
     holds: usize,
 }
 
+impl Kept {
+    /// Whether anything is known of it.
+    fn has_something(&self) -> bool {
+        !self.set.is_empty() || self.label.is_some()
+    }
+}
+
 /// A draft that was published: whose it is now, and which part of that log it is.
 #[derive(Debug)]
 struct Published {
@@ -114,7 +121,9 @@ impl Replica {
         if self.held + count > self.limits.records {
             return Err(Refusal::Full { what: "records", most: self.limits.records });
         }
-        if self.kept.len() >= self.limits.namespaces && !self.kept.contains_key(namespace) {
+        // What is there only because a frame holds it stays when the frame ends, as soon as it has something.
+        let known = self.kept.get(namespace).is_some_and(Kept::has_something);
+        if !known && self.kept.values().filter(|kept| kept.has_something()).count() >= self.limits.namespaces {
             return Err(Refusal::Full { what: "namespaces", most: self.limits.namespaces });
         }
         Ok(())
@@ -211,7 +220,7 @@ impl Replica {
 
     fn retire(&mut self, draft: &Namespace) {
         let Some(kept) = self.kept.get(draft).filter(|kept| kept.holds == 0) else { return };
-        if self.published.contains_key(draft) || (kept.set.is_empty() && kept.label.is_none()) {
+        if self.published.contains_key(draft) || !kept.has_something() {
             self.forget(draft);
         }
     }
@@ -577,6 +586,17 @@ mod tests {
         replica.insert(NAMESPACE, Tag::level(1), &[record(4, 0.0)]).expect("room");
         replica.hold(draft);
         assert_eq!((replica.mark(&draft).position, replica.census()), (0, (7, 3)));
+    }
+
+    /// Each such frame left a namespace more than there may be.
+    #[test]
+    fn a_frame_opened_when_all_is_full_leaves_nothing() {
+        let mut replica = Replica::new(Limits { namespaces: 1, ..Limits::default() });
+        replica.apply(Checked::Batch(NAMESPACE, Tag::level(1), vec![record(1, 0.0)])).expect("room");
+        replica.hold(DRAFT);
+        assert!(matches!(replica.apply(gathered(0, 0..5)), Err(Refusal::Full { what: "namespaces", .. })));
+        replica.release(&DRAFT);
+        assert_eq!(replica.census(), (1, 1));
     }
 
     #[test]

@@ -185,7 +185,7 @@ fn channel(name: &str, plane: Vec<f32>) -> AnyChannel<FlatSamples> {
 }
 
 /// Linear light to an 8-bit sRGB value.
-fn srgb(linear: f32) -> u8 {
+pub fn srgb(linear: f32) -> u8 {
     let v = linear.clamp(0.0, 1.0);
     let encoded = if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * libm::powf(v, 1.0 / 2.4) - 0.055 };
     (encoded * 255.0 + 0.5) as u8

@@ -17,6 +17,10 @@ use crate::world::Meeting;
 /// Greatest ratio of an ellipse's semi-axes.
 const ELONGATION: f32 = 2.0;
 
+/// Farthest the least R stretches what the gather met, times R: a record made in a gap of a tenth of a millimetre, where a ray
+/// leaked into it, says nothing of the pixels beside it (course notes, "ray leaking").
+const STRETCH: f32 = 16.0;
+
 /// Where a record is wanted.
 pub struct Site {
     /// The surface there.
@@ -107,13 +111,14 @@ impl Gather<'_> {
                 }
             }
         };
+        let radius = estimate.radius.clamp(f32::MIN_POSITIVE, 4.0 * self.tracer.world.radius);
         let own = |v: Vec2| site.at.frame.tangential(frame.x * v.x + frame.y * v.y);
         Irradiance {
             id,
             position: site.at.position,
             normal: site.at.normal(),
-            radius: estimate.radius.clamp(f32::MIN_POSITIVE, 4.0 * self.tracer.world.radius),
-            radius_min,
+            radius,
+            radius_min: radius_min.min(STRETCH * radius),
             radius_max,
             // A coat's share is negative: by noise a dark sum can be, too.
             irradiance: estimate.irradiance.max(Vec3::ZERO),
@@ -161,4 +166,57 @@ fn limited([xx, xy, yy]: [f32; 3], least: f32) -> [f32; 3] {
 fn turned(frame: Frame, fraction: f32) -> Frame {
     let (s, c) = cache_core::math::sin_cos(fraction * std::f32::consts::TAU);
     Frame { x: frame.x * c + frame.y * s, y: frame.y * c - frame.x * s, z: frame.z }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec2;
+
+    use super::*;
+    use crate::frame::Frame as Picture;
+    use crate::scene::{Camera, Material, Rgb, Scene, Surface, Triangle};
+    use crate::settings::Settings;
+
+    /// The record of a floor at the origin under a plate at this height.
+    fn under_a_plate(height: f32) -> Irradiance {
+        let material = Material {
+            name: String::new(),
+            color: Rgb::splat(0.5),
+            texture: None,
+            surface: Surface::Diffuse,
+            emission: Rgb::ONE,
+            double_sided: true,
+            bumps: None,
+            cached: true,
+        };
+        let level = |y: f32| Triangle {
+            positions: [Vec3::new(-9.0, y, -9.0), Vec3::new(0.0, y, 9.0), Vec3::new(9.0, y, -9.0)],
+            normals: None,
+            uvs: [Vec2::ZERO; 3],
+            material: 0,
+        };
+        let scene = Scene { triangles: vec![level(0.0), level(height)], materials: vec![material], ..Scene::default() };
+        let camera = Camera::look(Vec3::Y * height * 0.5, Vec3::NEG_Y, Vec3::X, 1.0, 1.0, false).expect("view");
+        let picture = Picture::new(scene, Settings { rays: 64, ..Settings::new(camera, 8, 8) });
+        let (levels, mut counts) = (Vec::new(), Counts::default());
+        let site = picture.site(1, 0, 4, 4, &mut counts).expect("the floor");
+        let site = Site { radius_bounds: (0.05, 0.4), ..site };
+        let strata = Strata::new(64);
+        let gather = Gather {
+            tracer: &picture.tracer(&levels),
+            namespace: picture.namespace(),
+            seed: 0,
+            level: 1,
+            rays: Rays::Fixed(&strata),
+            details: &picture.settings().details,
+        };
+        gather.record(gather.id(&site), &site, &mut counts)
+    }
+
+    #[test]
+    fn a_record_in_a_gap_says_nothing_of_what_lies_beside_it() {
+        let gap = under_a_plate(1e-4);
+        assert!(gap.radius < 1e-3 && gap.radius_min < 16e-3, "{gap:?}");
+        assert_eq!(under_a_plate(1.0).radius_min, 0.05);
+    }
 }
