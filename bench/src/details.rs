@@ -110,7 +110,10 @@ fn shown() -> Vec<(&'static str, &'static str, f32, Details)> {
 /// One picture for each detail, DIR/NAME.png: reference, with it, without it, where the last errs most; and a line.
 fn pictures(args: &DetailsArgs, folder: &Path) -> Result<(), Box<dyn Error>> {
     std::fs::create_dir_all(folder)?;
-    println!("128x128, --rays {} --spp {}; with -> without: records of level 1, RMSE, worst block", args.rays, args.spp);
+    println!(
+        "128x128, --rays {} --spp {}; with -> without: records of level 1, RMSE, worst block",
+        args.rays, args.spp
+    );
     for (name, scene, a, without) in shown() {
         if args.only.as_ref().is_some_and(|only| !name.contains(only.as_str())) {
             continue;
@@ -151,8 +154,7 @@ const ENLARGED: usize = 4;
 /// The same place of several pictures side by side, in sRGB, as bright as the first one's brightest there allow.
 fn strip(pictures: &[&Vec<[f64; 3]>], [left, top]: [usize; 2]) -> image::RgbImage {
     let at = |picture: &[[f64; 3]], x: usize, y: usize| picture[(top + y) * SIZE + left + x];
-    let mut bright: Vec<f64> =
-        (0..CROP * CROP).flat_map(|i| at(pictures[0], i % CROP, i / CROP)).collect();
+    let mut bright: Vec<f64> = (0..CROP * CROP).flat_map(|i| at(pictures[0], i % CROP, i / CROP)).collect();
     bright.sort_by(f64::total_cmp);
     let exposure = 0.9 / bright[bright.len() * 98 / 100];
     let gap = CROP * ENLARGED + 8;

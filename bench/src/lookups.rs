@@ -8,7 +8,7 @@ use cache_core::details::Details;
 use cache_core::id::Random;
 use cache_core::irradiance::Answer;
 use cache_core::math::Frame as Tangents;
-use cache_core::{Cached as _, Irradiance, Packed as _, Query, RecordId, Sealed};
+use cache_core::{Cached as _, Irradiance, Query, RecordId, Sealed};
 use glam::Vec3;
 use worker::frame::Frame;
 use worker::settings::Settings;
@@ -46,7 +46,9 @@ pub fn run(args: &LookupsArgs) -> Result<(), Box<dyn Error>> {
         args.questions,
         args.rounds
     );
-    println!("records   hits    naive     sealed    ratio | made: naive, sealed, sealed again with 1 % more | bytes a record");
+    println!(
+        "records   hits    naive     sealed    ratio | made: naive, sealed, sealed again with 1 % more | bytes a record"
+    );
     for &count in &args.records {
         let records = copies(&room, count);
         let questions = questions(&records, args.questions);
