@@ -8,6 +8,7 @@ use worker::solo::{self, Order};
 use worker::task::CpuClock;
 
 use crate::judge::{SIZE, judge, load, reduce, reference, settings};
+use crate::own;
 
 /// Which errors to ask for, and of what.
 #[derive(clap::Args)]
@@ -15,6 +16,9 @@ pub struct AskedArgs {
     /// Scenes as SCENE.DEPTH
     #[arg(default_values = ["cornell.full", "stairs.full", "leak.full", "sphere-plane.full", "glossy-floor.full", "white-furnace.full"])]
     scenes: Vec<String>,
+    /// The scenes of our own, that nothing was tuned on, in place of these; their references take minutes, once
+    #[arg(long)]
+    own: bool,
     /// Errors to ask for
     #[arg(long, value_delimiter = ',', default_values_t = [0.05f32, 0.02, 0.01])]
     error: Vec<f32>,
@@ -34,10 +38,15 @@ pub fn run(args: &AskedArgs) -> Result<(), Box<dyn Error>> {
         args.edge
     );
     println!("scene              asked    RMSE   bias  worst | believed                     | a     spp records | CPU");
-    for name in &args.scenes {
+    let own: Vec<_> = own::NAMES.iter().map(|name| format!("{name}.full")).collect();
+    for name in if args.own { &own } else { &args.scenes } {
         let (scene, depth) = name.split_once('.').ok_or("expected SCENE.DEPTH, for instance stairs.full")?;
-        let truth = reference(name);
-        let (scene, camera) = load(&format!("{scene}.glb"));
+        let (scene, camera, truth) = if args.own {
+            own::load(scene)?
+        } else {
+            let (scene, camera) = load(&format!("{scene}.glb"));
+            (scene, camera, reference(name))
+        };
         for &error in &args.error {
             let base =
                 worker::settings::Settings { width: args.edge, height: args.edge, ..settings(camera.clone(), depth) };

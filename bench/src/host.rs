@@ -126,12 +126,23 @@ fn socket(folder: &Path) -> PathBuf {
 /// The system's.
 pub fn usage() -> Result<Usage, nix::Error> {
     let usage = getrusage(UsageWho::RUSAGE_SELF)?;
-    let seconds = |time: nix::sys::time::TimeVal| time.tv_sec() as f64 + time.tv_usec() as f64 * 1e-6;
-    let cpu = seconds(usage.user_time()) + seconds(usage.system_time());
     // Linux counts the parent's memory into `max_rss` from before the program was its own.
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:")?.trim().strip_suffix(" kB")?.parse().ok());
-    Ok(Usage { cpu, peak: peak.map_or(usage.max_rss() as f64, |kilobytes: f64| kilobytes * 1024.0) })
+    let peak = peak.map_or(usage.max_rss() as f64, |kilobytes: f64| kilobytes * 1024.0);
+    Ok(Usage { cpu: seconds(&usage), peak })
+}
+
+/// CPU seconds of the children of this process that have ended, and of those they waited for.
+///
+/// # Errors
+/// The system's.
+pub fn children() -> Result<f64, nix::Error> {
+    Ok(seconds(&getrusage(UsageWho::RUSAGE_CHILDREN)?))
+}
+
+fn seconds(usage: &nix::sys::resource::Usage) -> f64 {
+    [usage.user_time(), usage.system_time()].iter().map(|t| t.tv_sec() as f64 + t.tv_usec() as f64 * 1e-6).sum()
 }
 
 /// The server's side: serves until its stdin ends, and answers each line there with its [`Usage`].

@@ -60,11 +60,11 @@ pub fn reduce(image: &[[f64; 3]]) -> Vec<[f64; 3]> {
     small
 }
 
-/// A reference picture with its standard error of luminance, pixel by pixel.
+/// A reference picture with its standard error, pixel by pixel.
 pub struct Reference {
     /// Linear RGB radiance, row by row.
     pub image: Vec<[f64; 3]>,
-    /// Standard error of each pixel's luminance.
+    /// Standard error of each pixel's luminance, or of its channels' root mean square.
     pub error: Vec<f64>,
 }
 
@@ -74,15 +74,42 @@ pub struct Reference {
 /// If the file is missing or damaged: it belongs to the repository.
 pub fn reference(name: &str) -> Reference {
     let path = file("references").join(format!("{name}.exr"));
-    let image = read_first_flat_layer_from_file(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
-    let channels = image.layer_data.channel_data.list;
-    let values = |name: &str| -> Vec<f64> {
-        let channel = channels.iter().find(|c| c.name.eq(name)).unwrap_or_else(|| panic!("no channel {name}"));
-        channel.sample_data.values_as_f32().map(f64::from).collect()
-    };
-    let [r, g, b] = ["R", "G", "B"].map(values);
-    let image = r.iter().zip(&g).zip(&b).map(|((r, g), b)| [*r, *g, *b]).collect();
-    Reference { image, error: values("stderr") }
+    Reference::read(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+}
+
+impl Reference {
+    /// Reads a file with the channels R, G, B and stderr.
+    ///
+    /// # Errors
+    /// One that is missing or damaged.
+    pub fn read(path: &Path) -> Result<Self> {
+        let image = read_first_flat_layer_from_file(path)?;
+        let channels = image.layer_data.channel_data.list;
+        let values = |name: &str| -> Result<Vec<f64>> {
+            let channel =
+                channels.iter().find(|c| c.name.eq(name)).ok_or(Error::Invalid("a missing channel".into()))?;
+            Ok(channel.sample_data.values_as_f32().map(f64::from).collect())
+        };
+        let [r, g, b] = [values("R")?, values("G")?, values("B")?];
+        let image = r.iter().zip(&g).zip(&b).map(|((r, g), b)| [*r, *g, *b]).collect();
+        Ok(Self { image, error: values("stderr")? })
+    }
+
+    /// Writes such a file, as high as wide.
+    ///
+    /// # Errors
+    /// The disk's.
+    pub fn write(&self, path: &Path) -> Result<()> {
+        let channel = |name, values: Vec<f64>| {
+            let values: Vec<f32> = values.into_iter().map(|v| v as f32).collect();
+            AnyChannel::new(name, FlatSamples::F32(values))
+        };
+        let color = |c: usize| self.image.iter().map(|p| p[c]).collect();
+        let channels = [channel("R", color(0)), channel("G", color(1)), channel("B", color(2))];
+        let list = channels.into_iter().chain([channel("stderr", self.error.clone())]).collect();
+        let edge = self.error.len().isqrt();
+        Image::from_channels((edge, edge), AnyChannels::sort(list)).write().to_file(path)
+    }
 }
 
 /// How far a picture is from a reference, relative to the reference's mean.

@@ -1,9 +1,17 @@
-//! The charts: speed against accuracy, rays, the service against the bare stream under it, farms that are simulated.
+//! The charts: speed against accuracy, other renderers, rays, the service against the bare stream under it, farms that are simulated.
 //!
 //! - [`judge`]: scenes with references, and the measure pictures of them are held to; the tests use it too.
+//! - [`model`]: scenes that are made up, and the files they are written to.
+//! - [`arcade`]: some 65 000 triangles with sun and sky.
+//! - [`louvres`]: a furnished room behind a window with louvres.
+//! - [`own`]: those two with references by our own path tracer.
 //! - [`pictures`]: speed against accuracy.
 //! - [`asked`]: whether a picture is as far from the truth as was asked for.
 //! - [`details`]: what each practical detail of irradiance caching buys.
+//! - [`peers`]: what others use, on the same scenes.
+//! - [`results`]: what pictures cost and how good they are, over several runs.
+//! - [`lamps`]: a thousand lamps against one.
+//! - [`start`]: from the start of the program to the first ray, and memory.
 //! - [`soups`]: rooms of many triangles, and rays in them.
 //! - [`rays`]: rays a second, against Embree.
 //! - [`lookups`]: look-ups a second, against an octree of pointers.
@@ -20,9 +28,19 @@ pub mod details;
 pub mod judge;
 pub mod pictures;
 
+pub mod arcade;
+pub mod louvres;
+pub mod model;
+pub mod own;
+
+pub mod peers;
+pub mod results;
+
+pub mod lamps;
 pub mod lookups;
 pub mod rays;
 pub mod soups;
+pub mod start;
 
 pub mod bare;
 pub mod host;

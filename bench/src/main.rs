@@ -3,7 +3,7 @@
 use std::error::Error;
 
 use ambience_bench::host::HostArgs;
-use ambience_bench::{asked, details, farm, host, lookups, pictures, rays, service};
+use ambience_bench::{asked, details, farm, host, lamps, lookups, peers, pictures, rays, service, start};
 use clap::{Parser, Subcommand};
 
 /// Speed against accuracy: every method at several settings, on the scenes with references.
@@ -27,6 +27,12 @@ enum Command {
     Rays(rays::RaysArgs),
     /// Look-ups a second, against an octree of pointers
     Lookups(lookups::LookupsArgs),
+    /// A thousand lamps against one
+    Lamps(lamps::LampsArgs),
+    /// Radiance, Mitsuba, and Mitsuba with Open Image Denoise, on the same scenes
+    Peers(peers::PeersArgs),
+    /// From the start of the program to its first rays, and memory, in an arcade of some 65 000 triangles
+    Start(start::StartArgs),
     /// The cache service against the bare stream under it
     Service(service::ServiceArgs),
     /// One frame by simulated farms of many sizes
@@ -44,6 +50,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         Some(Command::Asked(args)) => asked::run(&args),
         Some(Command::Rays(args)) => rays::run(&args),
         Some(Command::Lookups(args)) => lookups::run(&args),
+        Some(Command::Lamps(args)) => lamps::run(&args),
+        Some(Command::Peers(args)) => peers::run(&args),
+        Some(Command::Start(args)) => start::run(&args),
         Some(Command::Service(args)) => service::run(&args),
         Some(Command::Farm(args)) => farm::run(&args),
         Some(Command::Host(args)) => host::serve(&args),

@@ -20,8 +20,9 @@ use obvhs::rt_triangle::RtTriangle;
 use worker::bvh::Bvh;
 use worker::scene::Triangle;
 
+use crate::model::Corners;
 use crate::report::{Report, bars, quantile};
-use crate::soups::{self, Corners, Ray};
+use crate::soups::{self, Ray};
 
 /// Arguments of the benchmark.
 #[derive(Clone, Debug, clap::Args)]

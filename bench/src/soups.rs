@@ -4,10 +4,9 @@ use std::f32::consts::PI;
 
 use cache_core::id::Random;
 use cache_core::math::{Frame, sin_cos};
-use glam::{Vec2, Vec3};
+use glam::Vec3;
 
-/// One triangle.
-pub type Corners = [Vec3; 3];
+use crate::model::{Corners, sheet};
 
 /// A ray of unit direction, and how far a shadow ray goes along it.
 pub struct Ray {
@@ -26,17 +25,6 @@ fn waves(at: Vec3) -> f32 {
         sin_cos(x + shift).0 * sin_cos(y + 2.0 * shift).1 + sin_cos(z + 0.7 * shift).0
     };
     0.5 * wave(5.0, 0.3) + 0.25 * wave(13.0, 1.1) + 0.1 * wave(37.0, 2.3) + 0.04 * wave(101.0, 0.9)
-}
-
-/// A surface over the unit square in `columns` x `rows` cells of two triangles.
-fn sheet(columns: u32, rows: u32, at: impl Fn(Vec2) -> Vec3, soup: &mut Vec<Corners>) {
-    let corner = |x: u32, y: u32| at(Vec2::new(x as f32 / columns as f32, y as f32 / rows as f32));
-    for y in 0..rows {
-        for x in 0..columns {
-            let [a, b, c, d] = [corner(x, y), corner(x + 1, y), corner(x + 1, y + 1), corner(x, y + 1)];
-            soup.extend([[a, b, c], [a, c, d]]);
-        }
-    }
 }
 
 /// A closed room, 4 x 4 x 2, with hilly ground and a dozen bumpy balls: about 80 000 `detail`² triangles.
