@@ -186,7 +186,9 @@ impl Lights {
             Some(near) => 1.0 / near.solid_angle,
             None => distance * distance / (area * normal.dot(direction).abs()),
         };
-        self.chance(place, light) * density
+        // Seen along its plane the density has no bound, and no bound times no chance is no number.
+        let chance = self.chance(place, light);
+        if chance > 0.0 { chance * density } else { 0.0 }
     }
 
     /// What a ray that meets nothing sees: the radiance of each distant light in that direction, and its number where
@@ -212,7 +214,8 @@ impl Lights {
             Light::Triangle { index, area, normal, emission } => {
                 let corners = &world.scene.triangles[index as usize].positions;
                 let (end, density) = point_on(corners, normal, area, from, [u[1], u[2]])?;
-                let (pdf, direction) = (chance * density, (end - from).normalize());
+                // All but in the lamp's own plane the point may be the place itself.
+                let (pdf, direction) = (chance * density, (end - from).try_normalize()?);
                 let end = world.off_front(index, end);
                 (pdf > 0.0 && pdf.is_finite() && end.is_finite()).then(|| Arrival {
                     direction,

@@ -76,3 +76,34 @@ fn near_lamps_are_preferred() {
     assert!(near > 0.4, "{near}: by power it would be 0.005");
     assert!(tree.choose(&place(1.5), 0.5).is_none(), "behind and below all of them");
 }
+
+/// A point of a lamp a rounding behind or before a place on it has no direction from there.
+#[test]
+fn light_on_a_lamp_itself_is_finite() {
+    use crate::scene::{Material, Rgb, Scene, Surface, Triangle};
+    let corners = [Vec3::new(1.25, 2.25, 1.5), Vec3::new(1.75, 2.125, 1.375), Vec3::new(1.5, 2.5, 1.625)];
+    let material = Material {
+        name: String::new(),
+        color: Rgb::ZERO,
+        texture: None,
+        surface: Surface::Diffuse,
+        emission: Rgb::ONE,
+        double_sided: true,
+        bumps: None,
+        cached: true,
+    };
+    let triangle = Triangle { positions: corners, normals: None, uvs: [glam::Vec2::ZERO; 3], material: 0 };
+    let world = World::new(Scene { triangles: vec![triangle], materials: vec![material], ..Scene::default() });
+    let lights = Lights::new(&world, false);
+    let mut random = cache_core::id::Random::named("on a lamp", &[]);
+    for _ in 0..100_000 {
+        let [s, t] = [random.uniform().sqrt(), random.uniform()];
+        let position = corners[0] * (1.0 - s) + corners[1] * (s * (1.0 - t)) + corners[2] * (s * t);
+        let place = Place { position, normal: -facet(&world.scene.triangles[0]) };
+        let u = std::array::from_fn(|_| random.uniform());
+        let arrival = lights.sample(&world, &place, u);
+        assert!(arrival.is_none_or(|a| a.direction.is_normalized() && a.weight.is_finite()), "{position:?}");
+        let density = lights.pdf_triangle(&world, 0, &place, corners[1] - position, (corners[1] - position).length());
+        assert!(!density.is_nan(), "{position:?}");
+    }
+}
