@@ -42,7 +42,7 @@ pub mod defaults {
     /// Allowed interpolation error a.
     pub const A: f32 = 0.3;
     /// Rays in one gather.
-    pub const RAYS: u32 = 3072;
+    pub const RAYS: u32 = 6144;
     /// Seed.
     pub const SEED: u64 = 0;
 }
