@@ -64,8 +64,8 @@ pub fn run(args: &LookupsArgs) -> Result<(), Box<dyn Error>> {
         let extended = start.elapsed().as_secs_f64();
         let (mut times, mut hits) = ([Vec::new(), Vec::new()], [0u64; 2]);
         for _ in 0..args.rounds {
-            let asks: [&dyn Fn(&Query) -> Option<Answer>; 2] = [&|q| naive.ask(q), &|q| sealed.ask(q)];
-            for (which, ask) in asks.into_iter().enumerate() {
+            for which in 0..2 {
+                let ask = |q| if which == 0 { naive.ask(q) } else { sealed.ask(q) };
                 let start = Instant::now();
                 hits[which] = questions.iter().map(|q| u64::from(black_box(ask(q)).map_or(0, |a| a.records))).sum();
                 times[which].push(start.elapsed().as_secs_f64() / questions.len() as f64 * 1e9);

@@ -84,7 +84,7 @@ fn looks(level: u32) -> u32 {
     if level == 1 { LOOKS } else { LOOKS_DEEPER }
 }
 
-/// Ranks whose pixels a pass looks at in a picture of so many: all, or few enough for [`CANDIDATES`], then others in each look.
+/// Ranks whose pixels a pass looks at in a picture of so many: all, or so few that candidates do not grow with it, then others in each look.
 pub fn ranks(level: u32, pass: u32, pixels: u64) -> Range<u32> {
     let candidates = if level == 1 { CANDIDATES } else { CANDIDATES_DEEPER };
     let count = (u64::from(RANKS) * candidates / pixels.max(1)).clamp(1, RANKS.into()) as u32;
