@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use ambience_bench::judge::{judge, load, reference, settings};
+use ambience_bench::judge::{judge, load, reference, rgb, settings};
 use cache_core::details::Details;
 use cache_core::rounds::RANKS;
 use cache_proto::v1::frame_event::Event;
@@ -12,7 +12,7 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use worker::client::{self, Line};
 use worker::farm::Worker;
-use worker::frame::{CHANNELS, Frame};
+use worker::frame::Frame;
 use worker::settings::Settings;
 use worker::solo::{self, Filled, Order};
 use worker::spec;
@@ -30,7 +30,7 @@ fn records_go_where_the_light_changes() {
         let frame = Frame::new(scene, Settings { a, rays: 1024, spp: 16, details, ..settings(camera, "full") });
         let filled = solo::fill_ranks(&frame, Order::Rounds, RANKS);
         let pixels = solo::pixels(&frame, &filled.levels).0;
-        let image: Vec<_> = pixels.chunks_exact(CHANNELS).map(|p| [p[0].into(), p[1].into(), p[2].into()]).collect();
+        let image = rgb(&pixels);
         let (records, error) = (filled.levels.iter().map(|level| level.len()).sum::<usize>(), judge(&image, &truth));
         println!("a {a} {}: {records} records, {error:?}, {} passes", details.adaptive, filled.passes);
         error.rmse

@@ -1,7 +1,7 @@
 //! A picture is about as far from the truth as was asked for, and asking for less costs less.
 
-use ambience_bench::judge::{judge, load, reference, settings};
-use worker::frame::{CHANNELS, Counts, Frame};
+use ambience_bench::judge::{judge, load, reference, rgb, settings};
+use worker::frame::{Counts, Frame};
 use worker::pilot;
 use worker::solo::{self, Order};
 
@@ -12,7 +12,7 @@ fn asked(scene: &str, error: f32) -> (f64, f64, u64) {
     let (frame, forecast) = pilot::choose(Frame::new(file, settings(camera, "full")), error);
     let filled = solo::fill_ranks(&frame, Order::Rounds, cache_core::rounds::RANKS);
     let (pixels, counts) = solo::pixels(&frame, &filled.levels);
-    let image: Vec<_> = pixels.chunks_exact(CHANNELS).map(|p| [p[0].into(), p[1].into(), p[2].into()]).collect();
+    let image = rgb(&pixels);
     let rays = |c: &Counts| c.path_rays + c.shadow_rays;
     let all = rays(&forecast.counts) + rays(&filled.counts) + rays(&counts);
     (judge(&image, &truth).rmse, pilot::reached(&counts, &forecast).total(), all)

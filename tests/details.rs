@@ -7,21 +7,12 @@ use cache_core::Rgb;
 use cache_core::id::Random;
 use glam::{Vec2, Vec3};
 use worker::frame::{CHANNELS, Counts, Frame};
-use worker::scene::{Bumps, Camera, DistantLight, Material, Scene, Surface, Texture, Triangle, Wrap};
+use worker::scene::{Bumps, Camera, DistantLight, Material, Scene, Texture, Triangle, Wrap};
 use worker::settings::{Method, Settings};
 use worker::solo::{self, Order};
 
 fn white() -> Material {
-    Material {
-        name: "white".into(),
-        color: Rgb::splat(0.5),
-        texture: None,
-        surface: Surface::Diffuse,
-        emission: Rgb::ZERO,
-        double_sided: true,
-        bumps: None,
-        cached: true,
-    }
+    Material::diffuse(Rgb::splat(0.5))
 }
 
 /// A floor seen from above: u runs along x, v against z.

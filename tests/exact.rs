@@ -15,16 +15,7 @@ use worker::solo::{self, Order};
 const SIZE: u32 = 16;
 
 fn matter(color: f32, surface: Surface) -> Material {
-    Material {
-        name: String::new(),
-        color: Rgb::splat(color),
-        texture: None,
-        surface,
-        emission: Rgb::ZERO,
-        double_sided: true,
-        bumps: None,
-        cached: true,
-    }
+    Material { surface, ..Material::diffuse(Rgb::splat(color)) }
 }
 
 fn lamp(radiance: f32) -> Material {

@@ -2,12 +2,12 @@
 
 use std::error::Error;
 
-use worker::frame::{CHANNELS, Frame};
+use worker::frame::Frame;
 use worker::pilot;
 use worker::solo::{self, Order};
 use worker::task::CpuClock;
 
-use crate::judge::{SIZE, judge, load, reduce, reference, settings};
+use crate::judge::{SIZE, judge, load, reduce, reference, rgb, settings};
 use crate::own;
 
 /// Which errors to ask for, and of what.
@@ -61,8 +61,7 @@ pub fn run(args: &AskedArgs) -> Result<(), Box<dyn Error>> {
                 let seconds = [chosen, filled - chosen, clock.seconds() - filled];
                 (frame, forecast, levels.iter().map(|l| l.len()).collect::<Vec<_>>(), pixels, counts, seconds)
             });
-            let image: Vec<_> =
-                pixels.chunks_exact(CHANNELS).map(|p| [p[0].into(), p[1].into(), p[2].into()]).collect();
+            let image = rgb(&pixels);
             let v = judge(&reduce(&image), &truth);
             let e = pilot::reached(&counts, &forecast);
             let percent = |v: f64| 100.0 * v;

@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 
 use cache_core::details::{Details, Distance, Gradients, Metric, Spacing, Weighting};
 use cache_core::rounds::RANKS;
-use worker::frame::{CHANNELS, Frame};
+use worker::frame::Frame;
 use worker::settings::Settings;
 use worker::solo::{self, Order};
 use worker::task::CpuClock;
 
-use crate::judge::{SIZE, judge, load, reference, settings};
+use crate::judge::{SIZE, judge, load, reference, rgb, settings};
 
 /// Which choices to measure, and on what.
 #[derive(clap::Args)]
@@ -67,7 +67,7 @@ pub fn run(args: &DetailsArgs) -> Result<(), Box<dyn Error>> {
                     let pixels = solo::pixels(&frame, &filled.levels).0;
                     (filled, pixels, seconds)
                 });
-                let v = judge(&image(&pixels), &truth);
+                let v = judge(&rgb(&pixels), &truth);
                 let first = filled.levels.first().map_or(0, |l| l.len());
                 let all: usize = filled.levels.iter().map(|l| l.len()).sum();
                 let testing = 100.0 * filled.counts.test_seconds / seconds;
@@ -84,10 +84,6 @@ pub fn run(args: &DetailsArgs) -> Result<(), Box<dyn Error>> {
         }
     }
     Ok(())
-}
-
-fn image(pixels: &[f32]) -> Vec<[f64; 3]> {
-    pixels.chunks_exact(CHANNELS).map(|p| [p[0].into(), p[1].into(), p[2].into()]).collect()
 }
 
 /// Where each detail shows: the scene that breaks without it, the allowed error there, and what is done without it.
@@ -125,7 +121,7 @@ fn pictures(args: &DetailsArgs, folder: &Path) -> Result<(), Box<dyn Error>> {
             let base = settings(camera, depth);
             let frame = Frame::new(scene, Settings { a, rays: args.rays, spp: args.spp, details, ..base });
             let levels = solo::fill(&frame, Order::Rounds);
-            let image = image(&solo::pixels(&frame, &levels).0);
+            let image = rgb(&solo::pixels(&frame, &levels).0);
             let verdict = judge(&image, &truth);
             (image, levels.first().map_or(0, |level| level.len()), verdict)
         };
@@ -183,10 +179,7 @@ fn choices() -> Vec<(&'static str, Details)> {
         ("Ward 1992: split sphere alone", ward),
         ("split sphere", Details { metric: Metric::SplitSphere, ..usual }),
         ("split sphere, nearest", Details { metric: Metric::SplitSphere, distance: Distance::Nearest, ..usual }),
-        ("Hessian", Details { metric: Metric::Hessian, ..usual }),
-        ("Hessian, R not by gradient", Details { metric: Metric::Hessian, radius_by_gradient: false, ..usual }),
         ("no neighbor clamping", Details { neighbor_clamping: false, ..usual }),
-        ("Hessian, no clamping", Details { metric: Metric::Hessian, neighbor_clamping: false, ..usual }),
         ("gradients: none", Details { gradients: Gradients::None, rotation: false, ..usual }),
         ("gradients: samples", Details { gradients: Gradients::Samples, ..usual }),
         ("gradients: mesh", Details { gradients: Gradients::Mesh, ..usual }),

@@ -40,7 +40,11 @@ pub fn settings(camera: Camera, depth: &str) -> Settings {
 pub fn render(scene: Scene, settings: Settings) -> Vec<[f64; 3]> {
     let frame = Frame::new(scene, settings);
     let levels = solo::fill(&frame, Order::Rounds);
-    let (pixels, _) = solo::pixels(&frame, &levels);
+    rgb(&solo::pixels(&frame, &levels).0)
+}
+
+/// Linear RGB of a finished frame's pixels.
+pub fn rgb(pixels: &[f32]) -> Vec<[f64; 3]> {
     pixels.chunks_exact(CHANNELS).map(|p| [p[0].into(), p[1].into(), p[2].into()]).collect()
 }
 

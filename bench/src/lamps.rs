@@ -5,7 +5,7 @@ use std::error::Error;
 use cache_core::id::Random;
 use glam::{Vec2, Vec3};
 use worker::frame::{CHANNELS, Frame};
-use worker::scene::{Camera, Material, Rgb, Scene, Surface, Triangle};
+use worker::scene::{Camera, Material, Rgb, Scene, Triangle};
 use worker::settings::{Method, Settings};
 use worker::solo::{self, Order};
 use worker::task::CpuClock;
@@ -100,16 +100,7 @@ fn camera() -> Result<Camera, String> {
 /// The room, and lamps all over the upper half of it that face every way; all together have the power of one. One alone hangs
 /// in the middle and looks down.
 fn scene(lamps: usize) -> Scene {
-    let material = |color, emission| Material {
-        name: String::new(),
-        color,
-        texture: None,
-        surface: Surface::Diffuse,
-        emission,
-        double_sided: true,
-        bumps: None,
-        cached: true,
-    };
+    let material = |color, emission| Material { emission, ..Material::diffuse(color) };
     let materials = vec![material(Rgb::splat(0.6), Rgb::ZERO), material(Rgb::ZERO, Rgb::splat(100.0))];
     let triangle = |positions, material| Triangle { positions, normals: None, uvs: [Vec2::ZERO; 3], material };
     let mut triangles: Vec<_> = soups::room(0.3).into_iter().map(|corners| triangle(corners, 0)).collect();

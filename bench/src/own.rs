@@ -4,12 +4,12 @@
 use std::error::Error;
 use std::path::PathBuf;
 
-use worker::frame::{CHANNELS, Frame};
+use worker::frame::Frame;
 use worker::scene::{self, Camera, Scene};
 use worker::settings::{Method, Settings};
 use worker::solo;
 
-use crate::judge::{Reference, settings};
+use crate::judge::{Reference, rgb, settings};
 use crate::model::Model;
 use crate::{arcade, louvres};
 
@@ -53,8 +53,7 @@ pub fn load(name: &str) -> Result<(Scene, Camera, Reference), Box<dyn Error>> {
 /// Linear RGB by the path tracer, all bounces, at the size of references.
 fn traced(scene: &Scene, settings: Settings, spp: u32, seed: u64) -> Vec<[f64; 3]> {
     let frame = Frame::new(scene.clone(), Settings { method: Method::Path, spp, seed, ..settings });
-    let pixels = solo::pixels(&frame, &Vec::new()).0;
-    pixels.chunks_exact(CHANNELS).map(|p| [p[0].into(), p[1].into(), p[2].into()]).collect()
+    rgb(&solo::pixels(&frame, &Vec::new()).0)
 }
 
 fn reference(name: &str, scene: &Scene, camera: &Camera) -> Result<Reference, Box<dyn Error>> {

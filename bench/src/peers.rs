@@ -130,6 +130,17 @@ pub(crate) fn program() -> Result<PathBuf, Box<dyn Error>> {
     made.cloned().ok_or_else(|| format!("{}: not there; cargo build --release makes it", program.display()).into())
 }
 
+/// Runs a command to its end: wall seconds, and CPU seconds of its processes.
+///
+/// # Errors
+/// One that cannot be run, or fails.
+pub(crate) fn timed(command: &mut Command) -> Result<[f64; 2], Box<dyn Error>> {
+    let (before, start) = (children()?, Instant::now());
+    let status = command.status()?;
+    let seconds = [start.elapsed().as_secs_f64(), children()? - before];
+    if status.success() { Ok(seconds) } else { Err(format!("{command:?}: {status}").into()) }
+}
+
 /// The program as users run it.
 fn ours(files: &Files, args: &PeersArgs, keep: Keep) -> Result<Vec<(String, String)>, Box<dyn Error>> {
     let program = program()?;
@@ -139,12 +150,7 @@ fn ours(files: &Files, args: &PeersArgs, keep: Keep) -> Result<Vec<(String, Stri
         let mut command = Command::new(&program);
         command.arg("render").arg(&files.ambience).arg("-o").arg(&picture).arg("--quiet");
         command.args(["--error", &error.to_string(), "--size", &format!("{0}x{0}", args.edge)]);
-        let (before, start) = (children()?, Instant::now());
-        let status = command.status()?;
-        let (wall, cpu) = (start.elapsed().as_secs_f64(), children()? - before);
-        if !status.success() {
-            return Err(format!("{command:?}: {status}").into());
-        }
+        let [wall, cpu] = timed(&mut command)?;
         let image: Vec<_> = worker::film::read(&picture)?.rgb.into_iter().map(|p| p.map(f64::from)).collect();
         keep(&format!("--error {error}"), cpu, wall, &image);
     }

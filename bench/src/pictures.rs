@@ -6,8 +6,8 @@
 use std::error::Error;
 use std::time::Instant;
 
-use crate::judge::{SIZE, judge, load, reduce, reference, settings};
-use worker::frame::{CHANNELS, Frame};
+use crate::judge::{SIZE, judge, load, reduce, reference, rgb, settings};
+use worker::frame::Frame;
 use worker::settings::{Method, Settings};
 use worker::solo::{self, Order};
 
@@ -53,8 +53,7 @@ pub fn run(mut asked: Vec<String>) -> Result<(), Box<dyn Error>> {
             });
             let seconds = start.elapsed().as_secs_f64();
             let records: usize = levels.iter().map(|l| l.len()).sum();
-            let image: Vec<_> =
-                pixels.chunks_exact(CHANNELS).map(|p| [p[0].into(), p[1].into(), p[2].into()]).collect();
+            let image = rgb(&pixels);
             let v = judge(&reduce(&image), &truth);
             println!(
                 "{name:20} {label:28} {seconds:8.2} {records:8} {:6.2}% {:+6.2}% {:6.2}%",

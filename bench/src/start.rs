@@ -3,13 +3,12 @@
 
 use std::error::Error;
 use std::process::Command;
-use std::time::Instant;
 
 use serde_json::Value;
 use worker::scene;
 
 use crate::report::{Report, quantile};
-use crate::{host, judge, own, peers};
+use crate::{judge, own, peers};
 
 /// Arguments of the benchmark.
 #[derive(Clone, Debug, clap::Args)]
@@ -44,12 +43,7 @@ pub fn run(args: &StartArgs) -> Result<(), Box<dyn Error>> {
             let mut command = Command::new(&program);
             command.args(["render", "--quiet", "--size", "16x16", "--method", "path", "--spp", "1", "--workers", "1"]);
             command.arg(&path).arg("-o").arg(&picture).arg("--stats").arg(&stats);
-            let (before, start) = (host::children()?, Instant::now());
-            let status = command.status()?;
-            let (wall, cpu) = (start.elapsed().as_secs_f64(), host::children()? - before);
-            if !status.success() {
-                return Err(format!("{command:?}: {status}").into());
-            }
+            let [wall, cpu] = peers::timed(&mut command)?;
             let told: Value = serde_json::from_slice(&std::fs::read(&stats)?)?;
             let peaks = &told["peak_memory_bytes"];
             let peak = ["render_process", "largest_child"].map(|name| peaks[name].as_f64().unwrap_or(f64::NAN));

@@ -95,7 +95,6 @@ impl Server {
         let insisting = async {
             while let Err(status) = self.insert(number).await {
                 assert_eq!(status.code(), Code::Unavailable, "{status}");
-                tokio::time::sleep(std::time::Duration::from_millis(50)).await;
             }
         };
         tokio::time::timeout(support::PATIENCE, insisting).await.expect("kept, once there is room");

@@ -137,7 +137,7 @@ async fn metrics_tell_what_happened() {
             if expected.iter().all(|line| text.contains(line)) {
                 return;
             }
-            tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+            tokio::task::yield_now().await;
         }
     };
     let shown = tokio::time::timeout(support::PATIENCE, shown).await;

@@ -13,7 +13,7 @@ use cache_server::replica::Mark;
 use cache_server::spec::Job;
 use glam::{Vec2, Vec3};
 use prost::Message as _;
-use worker::scene::{Material, Scene, Surface, Triangle};
+use worker::scene::{Material, Scene, Triangle};
 use worker::settings::Settings;
 
 use super::{byte, pieces};
@@ -205,16 +205,7 @@ fn rendered(spec: &v1::FrameSpec) {
 /// A lit floor and a wall.
 fn room() -> Scene {
     static ROOM: OnceLock<Scene> = OnceLock::new();
-    let material = |color, emission| Material {
-        name: String::new(),
-        color,
-        texture: None,
-        surface: Surface::Diffuse,
-        emission,
-        double_sided: true,
-        bumps: None,
-        cached: true,
-    };
+    let material = |color, emission| Material { emission, ..Material::diffuse(color) };
     let triangle = |positions, material| Triangle { positions, normals: None, uvs: [Vec2::ZERO; 3], material };
     let room = || Scene {
         triangles: vec![

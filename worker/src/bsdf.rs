@@ -269,16 +269,7 @@ mod tests {
     use super::*;
 
     fn material(surface: Surface) -> Material {
-        Material {
-            name: String::new(),
-            color: Rgb::ONE,
-            texture: None,
-            surface,
-            emission: Rgb::ZERO,
-            double_sided: true,
-            bumps: None,
-            cached: true,
-        }
+        Material { surface, ..Material::diffuse(Rgb::ONE) }
     }
 
     fn models() -> Vec<(&'static str, Bsdf)> {

@@ -272,7 +272,7 @@ mod tests {
 
     #[test]
     fn addresses_are_read_and_shown() {
-        for sound in ["127.0.0.1:4670", "render-7.farm:80", "[::1]:4670", "unix:/tmp/a b", "unix:socket"] {
+        for sound in ["127.0.0.1:4670", "render-7.farm:80", "[::1]:4670", "unix:/a b", "unix:socket"] {
             assert_eq!(sound.parse::<Address>().expect(sound).to_string(), sound);
         }
         for wrong in ["", "host", "host:", ":80", "host:0", "host:70000", "unix:", "http://host:80", "a b:80"] {

@@ -174,21 +174,12 @@ mod tests {
 
     use super::*;
     use crate::frame::Frame as Picture;
-    use crate::scene::{Camera, Material, Rgb, Scene, Surface, Triangle};
+    use crate::scene::{Camera, Material, Rgb, Scene, Triangle};
     use crate::settings::Settings;
 
     /// The record of a floor at the origin under a plate at this height.
     fn under_a_plate(height: f32) -> Irradiance {
-        let material = Material {
-            name: String::new(),
-            color: Rgb::splat(0.5),
-            texture: None,
-            surface: Surface::Diffuse,
-            emission: Rgb::ONE,
-            double_sided: true,
-            bumps: None,
-            cached: true,
-        };
+        let material = Material { emission: Rgb::ONE, ..Material::diffuse(Rgb::splat(0.5)) };
         let level = |y: f32| Triangle {
             positions: [Vec3::new(-9.0, y, -9.0), Vec3::new(0.0, y, 9.0), Vec3::new(9.0, y, -9.0)],
             normals: None,

@@ -107,7 +107,7 @@ pub fn choose(frame: Frame, error: f32) -> (Frame, Forecast) {
         [aim, f64::INFINITY, f64::INFINITY]
     } else {
         // Rays it takes to bring either mean square to 1: of all pixels, and of as many records as the pilot made.
-        let pixels = f64::from(asked.width) * f64::from(asked.height);
+        let pixels = asked.size() as f64;
         let by_sampling = pixels * seen.rays_a_sample * seen.deviation * sampling;
         let by_noise = seen.rays_of_fill * (seen.noise * most).powi(2);
         divide(aim, [by_sampling, by_noise], interpolation)
@@ -173,8 +173,7 @@ struct Seen {
 
 fn look(frame: &Frame) -> Seen {
     let settings = frame.settings();
-    let size = settings.width * settings.height;
-    let ranks = (u64::from(RANKS) * u64::from(PIXELS) / u64::from(size.max(1))).clamp(1, RANKS.into()) as u32;
+    let ranks = (u64::from(RANKS) * u64::from(PIXELS) / settings.size().max(1)).clamp(1, RANKS.into()) as u32;
     let solo::Filled { levels, counts: filling, .. } = solo::fill_ranks(frame, Order::Rounds, ranks);
     let rays = |counts: &Counts| (counts.path_rays + counts.shadow_rays) as f64;
     let mut seen = Seen { rays_of_fill: rays(&filling), ..Seen::default() };

@@ -80,18 +80,9 @@ fn near_lamps_are_preferred() {
 /// A point of a lamp a rounding behind or before a place on it has no direction from there.
 #[test]
 fn light_on_a_lamp_itself_is_finite() {
-    use crate::scene::{Material, Rgb, Scene, Surface, Triangle};
+    use crate::scene::{Material, Rgb, Scene, Triangle};
     let corners = [Vec3::new(1.25, 2.25, 1.5), Vec3::new(1.75, 2.125, 1.375), Vec3::new(1.5, 2.5, 1.625)];
-    let material = Material {
-        name: String::new(),
-        color: Rgb::ZERO,
-        texture: None,
-        surface: Surface::Diffuse,
-        emission: Rgb::ONE,
-        double_sided: true,
-        bumps: None,
-        cached: true,
-    };
+    let material = Material { emission: Rgb::ONE, ..Material::diffuse(Rgb::ZERO) };
     let triangle = Triangle { positions: corners, normals: None, uvs: [glam::Vec2::ZERO; 3], material: 0 };
     let world = World::new(Scene { triangles: vec![triangle], materials: vec![material], ..Scene::default() });
     let lights = Lights::new(&world, false);

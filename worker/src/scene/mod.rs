@@ -73,6 +73,22 @@ pub struct Material {
     pub cached: bool,
 }
 
+impl Material {
+    /// Paint: Lambert on both sides, without light, pictures or bumps; records answer for it.
+    pub fn diffuse(color: Rgb) -> Self {
+        Self {
+            name: String::new(),
+            color,
+            texture: None,
+            surface: Surface::Diffuse,
+            emission: Rgb::ZERO,
+            double_sided: true,
+            bumps: None,
+            cached: true,
+        }
+    }
+}
+
 /// Normals from a picture: (x, y, z) as 2 texel - 1, z along the smooth normal, as in glTF.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bumps {
