@@ -14,11 +14,8 @@ const WIDTH: usize = 8;
 /// Levels of cells over `u32::MAX` balls.
 const LEVELS_MAX: usize = 10;
 
-/// A ball is filed so much wider, relative to its reach and to its distance from the origin, that no rounding loses it.
-const SLACK: [f32; 2] = [1.0 + 1e-5, 3e-7];
-
-/// Squares of shorter lengths lose digits.
-const REACH_LEAST: f32 = 1e-17;
+/// A ball is filed so much wider that no rounding of a distance loses it.
+const SLACK: f32 = 1.0 + 1e-5;
 
 /// Eight numbers, one for each part.
 type Eight = [Vec4; 2];
@@ -54,10 +51,10 @@ impl Octree {
         let mut blocks = vec![Block::EMPTY; count];
         let mut boxes = vec![Aabb::EMPTY; count];
         for (i, (center, reach)) in balls.enumerate() {
-            let reach = reach.max(REACH_LEAST) * SLACK[0];
+            let reach = reach * SLACK;
             blocks[i / WIDTH].set(i % WIDTH, center, reach);
-            let aside = Vec3::splat(reach) + center.abs() * SLACK[1];
-            boxes[i / WIDTH].unite(Aabb { low: center - aside, high: center + aside });
+            // A border that is rounded has no point on its other side.
+            boxes[i / WIDTH].unite(Aabb { low: center - reach, high: center + reach });
         }
         let mut levels = Vec::new();
         while boxes.len() > 1 {
@@ -221,6 +218,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::id::Random;
 
     fn tree(balls: &mut [(Vec3, f32)]) -> Octree {
         balls.sort_by(|a, b| order(a.0, b.0));
@@ -294,5 +292,25 @@ mod tests {
             }
         }
         tree.visit(Vec3::splat(f32::NAN), |_| panic!("nowhere"));
+    }
+
+    /// Where squares lose digits, far from the origin where places do, and anywhere a rounding inside the border.
+    #[test]
+    fn no_rounding_loses_a_ball() {
+        let mut random = Random::named("borders", &[]);
+        let mut direction = || Vec3::from([(); 3].map(|()| random.uniform() - 0.5)).normalize();
+        for k in 0..40_000 {
+            let reach = [1e-23 * 1.1f32.powi(k % 80), 1e-3, 2.0, 1e9][k as usize % 4];
+            for center in [Vec3::ZERO, Vec3::new(0.3, 0.7, -0.2), Vec3::new(1e3, -7e5, 3e6)] {
+                let at = center + direction() * reach;
+                let tree = Octree::new([(center, reach), (center + 1.0, reach)].into_iter());
+                let mut seen = false;
+                tree.visit(at, |ball| {
+                    seen |= ball == 0;
+                    true
+                });
+                assert!(seen || center.distance(at) >= reach * (1.0 - 1e-7), "{reach} round {center}: {at}");
+            }
+        }
     }
 }

@@ -368,6 +368,26 @@ mod tests {
         }
     }
 
+    /// Whichever came first.
+    #[test]
+    fn records_of_one_site_are_summed_by_id() {
+        let record = crate::irradiance::tests::sound();
+        let each = |i: u8| {
+            let irradiance = Vec3::splat([0.3, 0.4, 0.45, 1e7][usize::from(i)]);
+            Irradiance { id: RecordId(i.into()), irradiance, ..record }
+        };
+        let answer = |ids: [u8; 4]| {
+            let mut sealed = Sealed::new(0.3);
+            ids.into_iter().for_each(|i| sealed.extend([each(i)]));
+            let at = Query::new(record.position + Vec3::X * 0.1, record.normal);
+            sealed.ask(&at).map(|a| a.irradiance.x.to_bits())
+        };
+        let first = answer([0, 1, 2, 3]);
+        for ids in [[3, 2, 1, 0], [2, 0, 3, 1], [1, 3, 0, 2]] {
+            assert_eq!(answer(ids), first, "{ids:?}");
+        }
+    }
+
     /// What the packed record and its place in the octree take, no more.
     #[test]
     fn a_record_of_irradiance_takes_at_most_160_bytes() {

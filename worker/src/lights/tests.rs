@@ -97,4 +97,13 @@ fn light_on_a_lamp_itself_is_finite() {
         let density = lights.pdf_triangle(&world, 0, &place, corners[1] - position, (corners[1] - position).length());
         assert!(!density.is_nan(), "{position:?}");
     }
+    // Far away in a lamp's plane: no chance, and a density without bound.
+    let level = [Vec3::ZERO, Vec3::X, Vec3::Y];
+    let world = World::new(Scene {
+        triangles: vec![Triangle { positions: level, ..triangle }],
+        materials: world.scene.materials,
+        ..Scene::default()
+    });
+    let place = Place { position: Vec3::X * 50.0, normal: Vec3::NEG_X };
+    assert_eq!(Lights::new(&world, false).pdf_triangle(&world, 0, &place, Vec3::NEG_X, 49.5), 0.0);
 }
