@@ -3,6 +3,8 @@
 use std::fs::File;
 use std::io;
 use std::os::unix::fs::FileExt as _;
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// What an append waits for.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -22,6 +24,7 @@ const BLOCK: usize = 4096;
 pub(super) struct Device {
     file: File,
     sync: Sync,
+    undo: Undo,
     #[cfg(test)]
     room: tests::Room,
     #[cfg(test)]
@@ -29,15 +32,72 @@ pub(super) struct Device {
 }
 
 impl Device {
-    pub(super) fn new(file: File, sync: Sync) -> Self {
+    pub(super) fn new(file: File, sync: Sync, undo: Undo) -> Self {
         Self {
             file,
             sync,
+            undo,
             #[cfg(test)]
             room: tests::ROOM.with_borrow(Clone::clone),
             #[cfg(test)]
             unsynced: tests::UNSYNCED.with_borrow(Clone::clone),
         }
+    }
+}
+
+/// What a file was before it was changed, for as long as nobody knows whether it is sound: redb writes to a file while it
+/// is opened, and a damaged one is to be kept as it was found.
+#[derive(Clone, Default, Debug)]
+pub(super) struct Undo(Arc<Mutex<Option<Vec<Before>>>>);
+
+/// A file's length, and some of its bytes, before a change.
+#[derive(Clone, Debug)]
+struct Before {
+    length: u64,
+    offset: u64,
+    bytes: Vec<u8>,
+}
+
+impl Before {
+    /// Of a change to `count` bytes from `offset` on, or to all behind it.
+    fn of(file: &File, offset: u64, count: usize) -> io::Result<Self> {
+        let length = file.metadata()?.len();
+        let mut bytes = vec![0; count.min(length.saturating_sub(offset) as usize)];
+        file.read_exact_at(&mut bytes, offset)?;
+        Ok(Self { length, offset, bytes })
+    }
+}
+
+impl Undo {
+    /// One that notes every change until they are kept or taken back.
+    pub(super) fn noting() -> Self {
+        Self(Arc::new(Mutex::new(Some(Vec::new()))))
+    }
+
+    fn note(&self, file: &File, offset: u64, count: usize) -> io::Result<()> {
+        if let Some(noted) = &mut *self.0.lock().unwrap_or_else(PoisonError::into_inner) {
+            noted.push(Before::of(file, offset, count)?);
+        }
+        Ok(())
+    }
+
+    /// The changes stay, and no more are noted.
+    pub(super) fn keep(&self) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    }
+
+    /// Makes a file, which no device has open any more, what it was.
+    pub(super) fn apply(&self, path: &Path) -> io::Result<()> {
+        let noted = self.0.lock().unwrap_or_else(PoisonError::into_inner).take().unwrap_or_default();
+        if noted.is_empty() {
+            return Ok(());
+        }
+        let file = File::options().write(true).open(path)?;
+        for before in noted.iter().rev() {
+            file.write_all_at(&before.bytes, before.offset)?;
+            file.set_len(before.length)?;
+        }
+        file.sync_data()
     }
 }
 
@@ -52,7 +112,8 @@ impl redb::StorageBackend for Device {
 
     fn set_len(&self, len: u64) -> io::Result<()> {
         #[cfg(test)]
-        self.unsynced.iter().try_for_each(|unsynced| unsynced.changes(&self.file, len, 0))?;
+        self.unsynced.iter().try_for_each(|unsynced| unsynced.changes(&self.file, len, usize::MAX))?;
+        self.undo.note(&self.file, len, usize::MAX)?;
         self.file.set_len(len)
     }
 
@@ -72,6 +133,7 @@ impl redb::StorageBackend for Device {
         tests::take(&self.room, data.len())?;
         #[cfg(test)]
         self.unsynced.iter().try_for_each(|unsynced| unsynced.changes(&self.file, offset, data.len()))?;
+        self.undo.note(&self.file, offset, data.len())?;
         let zeros = data.rchunks(BLOCK).take_while(|block| block.iter().fold(0, |all, byte| all | byte) == 0);
         let used = data.len() - zeros.map(<[u8]>::len).sum::<usize>();
         if used < data.len() && self.is_hole(offset + used as u64, (data.len() - used) as u64) {
@@ -112,6 +174,8 @@ pub(super) mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
     use std::sync::{Arc, Mutex};
 
+    use super::Before;
+
     /// Bytes that can still be written before the disk is full.
     pub(crate) type Room = Arc<AtomicUsize>;
 
@@ -135,33 +199,20 @@ pub(super) mod tests {
 
     #[derive(Default, Debug)]
     struct Noted {
-        since: Vec<Undo>,
+        since: Vec<Before>,
         moments: Vec<Moment>,
-    }
-
-    /// The file's length, and some of its bytes, before a change.
-    #[derive(Clone, Debug)]
-    struct Undo {
-        length: u64,
-        offset: u64,
-        bytes: Vec<u8>,
     }
 
     /// A file as its process sees it, and what of it may not be on the device.
     #[derive(Debug)]
     pub(crate) struct Moment {
         file: Vec<u8>,
-        unsynced: Vec<Undo>,
+        unsynced: Vec<Before>,
     }
 
     impl Unsynced {
-        /// Bytes from `offset` on are about to change: `count` of them, or all behind if the length does.
         pub(super) fn changes(&self, file: &File, offset: u64, count: usize) -> io::Result<()> {
-            let length = file.metadata()?.len();
-            let behind = length.saturating_sub(offset) as usize;
-            let mut bytes = vec![0; if count == 0 { behind } else { count.min(behind) }];
-            file.read_exact_at(&mut bytes, offset)?;
-            self.0.lock().expect("no panic").since.push(Undo { length, offset, bytes });
+            self.0.lock().expect("no panic").since.push(Before::of(file, offset, count)?);
             Ok(())
         }
 
@@ -191,7 +242,7 @@ pub(super) mod tests {
         /// What is left of it when the power is cut: each change that was not waited for is there or not, as `kept` says.
         pub(crate) fn cut(&self, mut kept: impl FnMut() -> bool) -> Vec<u8> {
             let mut file = self.file.clone();
-            for Undo { length, offset, bytes } in self.unsynced.iter().rev().filter(|_| !kept()) {
+            for Before { length, offset, bytes } in self.unsynced.iter().rev().filter(|_| !kept()) {
                 let end = *offset as usize + bytes.len();
                 file.resize(file.len().max(end), 0);
                 file[*offset as usize..end].copy_from_slice(bytes);

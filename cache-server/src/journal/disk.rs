@@ -11,7 +11,7 @@ use cache_proto::v1::Entry;
 use redb::{Database, ReadableDatabase as _, ReadableTable as _, ReadableTableMetadata as _, TableDefinition};
 
 use super::Journal;
-use super::device::{Device, Sync};
+use super::device::{Device, Sync, Undo};
 use super::recovery::{self, OpenError, Report};
 use super::value::{self, FORMAT, MAGIC, Place};
 
@@ -67,7 +67,7 @@ impl Disk {
     /// The database, opened again if an append failed.
     fn database(&mut self) -> io::Result<&Database> {
         if self.database.is_none() {
-            let database = open(&self.path, self.sync, |_| ()).map_err(plain)?;
+            let database = open(&self.path, self.sync, Undo::default(), |_| ()).map_err(plain)?;
             let next = last(&database).map_err(plain)?;
             if next.sequence < self.next.sequence {
                 let (there, kept) = (next.sequence, self.next.sequence);
@@ -129,19 +129,20 @@ impl Journal for Disk {
 pub(super) fn open(
     path: &Path,
     sync: Sync,
+    undo: Undo,
     unclean: impl Fn(&mut redb::RepairSession) + 'static,
 ) -> Result<Database, redb::Error> {
     let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)?;
     let mut builder = Database::builder();
     builder.set_cache_size(CACHE_BYTES).set_check_integrity_on_open(true).set_repair_callback(unclean);
-    Ok(builder.create_with_backend(Device::new(file, sync))?)
+    Ok(builder.create_with_backend(Device::new(file, sync, undo))?)
 }
 
 /// Opens a file that must not be written to.
 pub(super) fn open_read_only(path: &Path) -> Result<redb::ReadOnlyDatabase, redb::Error> {
     let mut builder = Database::builder();
     builder.set_cache_size(CACHE_BYTES);
-    Ok(builder.open_read_only_with_backend(Device::new(File::open(path)?, Sync::PageCache))?)
+    Ok(builder.open_read_only_with_backend(Device::new(File::open(path)?, Sync::PageCache, Undo::default()))?)
 }
 
 /// Makes a new file a journal.

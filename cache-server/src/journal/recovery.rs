@@ -11,7 +11,7 @@ use std::{cell::Cell, rc::Rc};
 
 use redb::Database;
 
-use super::device::Sync;
+use super::device::{Sync, Undo};
 use super::disk::{self, Wrong};
 use super::salvage::{self, Found, Gaps};
 use super::value::{self, FORMAT, Place};
@@ -117,7 +117,7 @@ pub(super) fn open(path: &Path, sync: Sync) -> Result<(Database, Place, Report),
         Err(error) => return Err(failed(error)),
     };
     if !known {
-        let database = disk::open(path, sync, |_| ()).map_err(|e| failed(disk::plain(e)))?;
+        let database = disk::open(path, sync, Undo::default(), |_| ()).map_err(|e| failed(disk::plain(e)))?;
         disk::begin(&database).map_err(|e| failed(disk::plain(e)))?;
         sync_directory(path).map_err(failed)?;
         return Ok((database, Place::default(), Report::default()));
@@ -135,16 +135,27 @@ pub(super) fn open(path: &Path, sync: Sync) -> Result<(Database, Place, Report),
     }
 }
 
-/// Opens a file and checks every value of it; what is wrong with it otherwise.
+/// Opens a file and checks every value of it; what is wrong with it otherwise, and the file is as it was.
+fn check(path: &Path, sync: Sync) -> Result<Result<(Database, Place, Report), String>, OpenError> {
+    let undo = Undo::noting();
+    let checked = check_noting(path, sync, &undo);
+    match checked {
+        Ok(Ok(_)) => undo.keep(),
+        _ => undo.apply(path).map_err(|error| OpenError::File { path: path.into(), error })?,
+    }
+    checked
+}
+
+/// The same, with what was changed noted.
 ///
 /// After a crash redb may go back to the append before the last. The values beyond, which lie there all the same, are
 /// added again: they were sound before they were appended.
-fn check(path: &Path, sync: Sync) -> Result<Result<(Database, Place, Report), String>, OpenError> {
+fn check_noting(path: &Path, sync: Sync, undo: &Undo) -> Result<Result<(Database, Place, Report), String>, OpenError> {
     let failed = |error: io::Error| OpenError::File { path: path.into(), error };
     let crashed = Rc::new(Cell::new(false));
     let told = crashed.clone();
     let opened = contained(|| {
-        disk::open(path, sync, move |repair| {
+        disk::open(path, sync, undo.clone(), move |repair| {
             told.set(true);
             repair.abort();
         })
@@ -152,7 +163,7 @@ fn check(path: &Path, sync: Sync) -> Result<Result<(Database, Place, Report), St
     let (opened, beyond) = match opened {
         Ok(Err(_)) if crashed.get() => {
             let beyond = Found::scan(&File::open(path).map_err(failed)?).map_err(failed)?;
-            (contained(|| disk::open(path, sync, |_| ())), beyond)
+            (contained(|| disk::open(path, sync, undo.clone(), |_| ())), beyond)
         }
         opened => (opened, Found::default()),
     };
@@ -198,12 +209,12 @@ fn repair(path: &Path, reason: String) -> Result<Damage, OpenError> {
     let new = beside(path, "new");
     let build = || -> io::Result<()> {
         {
-            let database = disk::open(&new, Sync::Device, |_| ()).map_err(disk::plain)?;
+            let database = disk::open(&new, Sync::Device, Undo::default(), |_| ()).map_err(disk::plain)?;
             disk::begin(&database).map_err(disk::plain)?;
             copy(&file, &found.values, &database, Place::default())?;
         }
         // Nothing is believed that was not read back.
-        let database = disk::open(&new, Sync::Device, |_| ()).map_err(disk::plain)?;
+        let database = disk::open(&new, Sync::Device, Undo::default(), |_| ()).map_err(disk::plain)?;
         let mut rest = found.values.iter();
         let same = disk::read(&database, |_, read| {
             let written = rest.next().map(|(at, header)| salvage::payload(&file, *at, header));
