@@ -31,6 +31,8 @@ pub mod details;
 pub mod hemisphere;
 pub mod mesh;
 
+pub mod hsh;
+
 pub mod clamp;
 pub mod octree;
 pub mod sealed;
