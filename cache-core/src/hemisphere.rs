@@ -155,10 +155,7 @@ impl Strata {
                 *gradients = std::array::from_fn(|c| relative * irradiance[c]);
             }
         }
-        let distance = match details.distance {
-            Distance::Harmonic => rays / samples.iter().map(|s| 1.0 / s.distance).sum::<f32>(),
-            Distance::Nearest => samples.iter().map(|s| s.distance).fold(f32::INFINITY, f32::min),
-        };
+        let distance = distance(samples, details.distance);
         let slope = gradient_t.iter().sum::<Vec2>().length();
         let by_gradient =
             if details.radius_by_gradient && slope > 0.0 { irradiance.element_sum() / slope } else { f32::INFINITY };
@@ -167,7 +164,7 @@ impl Strata {
             (Metric::Hessian, Some(mesh)) if mean > 0.0 => absolute(mesh.hessian).map(|h| h / (2.0 * mean)),
             _ => [0.0; 3],
         };
-        let noise = PI * self.variance(samples).sqrt() / rays.sqrt();
+        let noise = PI * variance(samples, self.azimuthal).sqrt() / rays.sqrt();
         Estimate { irradiance, gradient_t, gradient_r, radius: distance.min(by_gradient), ellipse, noise }
     }
 
@@ -222,21 +219,30 @@ impl Strata {
         }
         sum
     }
+}
 
-    /// Variance of one sample about what its cell sees, mean of the channels, (W/(sr m²))².
-    ///
-    /// By second differences round each ring: what changes evenly from cell to cell is no noise. (The standard deviation of
-    /// every second ray, Krivanek 2006, sees even changes as noise too.)
-    fn variance(&self, samples: &[Sample]) -> f32 {
-        let n = self.azimuthal;
-        let bend = |row: &[Sample], k: usize| {
-            let [before, here, after] = [(k + n - 1) % n, k, (k + 1) % n].map(|k| row[k].radiance);
-            (before - here * 2.0 + after).length_squared()
-        };
-        let rows = samples.chunks_exact(n);
-        let sum: f32 = rows.map(|row| (0..n).map(|k| bend(row, k)).sum::<f32>()).sum();
-        // A second difference of independent samples varies six times as much as one of them.
-        sum / (6.0 * 3.0 * samples.len() as f32)
+/// Variance of one sample about what its cell sees, mean of the channels, (W/(sr m²))². The samples come ring by ring,
+/// `azimuthal` in each.
+///
+/// By second differences round each ring: what changes evenly from cell to cell is no noise. (The standard deviation of
+/// every second ray, Krivanek 2006, sees even changes as noise too.)
+pub(crate) fn variance(samples: &[Sample], azimuthal: usize) -> f32 {
+    let n = azimuthal;
+    let bend = |row: &[Sample], k: usize| {
+        let [before, here, after] = [(k + n - 1) % n, k, (k + 1) % n].map(|k| row[k].radiance);
+        (before - here * 2.0 + after).length_squared()
+    };
+    let rows = samples.chunks_exact(n);
+    let sum: f32 = rows.map(|row| (0..n).map(|k| bend(row, k)).sum::<f32>()).sum();
+    // A second difference of independent samples varies six times as much as one of them.
+    sum / (6.0 * 3.0 * samples.len() as f32)
+}
+
+/// What is taken as the distance of all that the samples met, world length; may be infinite.
+pub(crate) fn distance(samples: &[Sample], kind: Distance) -> f32 {
+    match kind {
+        Distance::Harmonic => samples.len() as f32 / samples.iter().map(|s| 1.0 / s.distance).sum::<f32>(),
+        Distance::Nearest => samples.iter().map(|s| s.distance).fold(f32::INFINITY, f32::min),
     }
 }
 

@@ -14,6 +14,7 @@ use glam::{Vec2, Vec3};
 use crate::cached::{Cached, Invalid, Packed, Query};
 use crate::id::RecordId;
 use crate::math::{Frame, Rgb};
+use crate::site;
 
 /// A record of irradiance.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -72,25 +73,16 @@ impl Cached for Irradiance {
         (self.radius_min, self.radius_max)
     }
 
-    /// The error e is that of Ward 1988 eq. 5, or the ellipse's where that says more. A record in front of the query (Ward
-    /// 1988 eq. 6) does not count; the test's tolerance scales with R.
+    /// The error e is that of Ward 1988 eq. 5, or the ellipse's where that says more.
     #[inline]
     fn error(&self, query: &Query, radius: f32, a: f32) -> f32 {
-        let offset = query.position - self.position;
-        let mut translation = offset.length() / radius;
-        // sqrt(1 - n·n_i) without its cancellation: |n - n_i|² = 2 (1 - n·n_i) for unit vectors.
-        let rotation = (query.normal - self.normal).length() * std::f32::consts::FRAC_1_SQRT_2;
-        if translation + rotation >= a {
+        let Some((mut translation, rotation)) = site::error(self.position, self.normal, query, radius, a) else {
             return f32::INFINITY;
-        }
+        };
         let [xx, xy, yy] = self.ellipse;
         if xx + yy > 0.0 {
-            let Vec2 { x, y } = Frame::around(self.normal).tangential(offset);
+            let Vec2 { x, y } = Frame::around(self.normal).tangential(query.position - self.position);
             translation = translation.max((x * x * xx + 2.0 * x * y * xy + y * y * yy).max(0.0).sqrt());
-        }
-        let behind = offset.dot(query.normal + self.normal) * 0.5;
-        if behind < -IN_FRONT_TOLERANCE * radius {
-            return f32::INFINITY;
         }
         translation + rotation
     }
@@ -162,16 +154,6 @@ impl Packed for Irradiance {
     }
 }
 
-/// No scene is larger: squares of such lengths still fit a float, so nothing derived from a record overflows.
-const LENGTH_MAX: f32 = 1e18;
-
-/// Least R, as part of the record's distance from the origin and of radius_max: 2^-32, some 500 times less than the
-/// spacing of floats.
-const RADIUS_LEAST: f32 = 1.0 / (1u64 << 32) as f32;
-
-/// How far, in R, a record may lie in front of a query and still count: enough for curved surfaces made of facets.
-const IN_FRONT_TOLERANCE: f32 = 0.01;
-
 impl Irradiance {
     fn floats(&self) -> [f32; FLOATS] {
         let [p, n, e] = [self.position, self.normal, self.irradiance];
@@ -232,37 +214,7 @@ impl Irradiance {
             let unsound = FIELDS.iter().find(|(_, count)| values.by_ref().take(*count).any(|v| !v.is_finite()));
             return Err(Invalid::NotFinite { field: unsound.map_or("a field", |(field, _)| field) });
         }
-        let length = self.normal.length();
-        if (length - 1.0).abs() > 1e-3 {
-            return Err(Invalid::Normal { length });
-        }
-        let positive = |field, value: f32| {
-            (value > 0.0).then_some(()).ok_or(Invalid::Range { field, value, expected: "more than 0" })
-        };
-        let reach = self.position.abs().max_element();
-        if reach > LENGTH_MAX {
-            return Err(Invalid::Range { field: "position", value: reach, expected: "at most 1e18" });
-        }
-        positive("radius", self.radius)?;
-        positive("radius_min", self.radius_min)?;
-        if self.radius_max <= RADIUS_LEAST * reach {
-            let expected = "more than 2^-32 of its distance from the origin";
-            return Err(Invalid::Range { field: "radius_max", value: self.radius_max, expected });
-        }
-        // Far below the spacing of floats there, R tells nothing; clamped by it, all records around would be worth nothing.
-        if self.radius <= RADIUS_LEAST * reach.max(self.radius_max) {
-            let expected = "more than 2^-32 of its distance from the origin and of radius_max";
-            return Err(Invalid::Range { field: "radius", value: self.radius, expected });
-        }
-        for (field, value) in [("radius", self.radius), ("radius_max", self.radius_max)] {
-            if value > LENGTH_MAX {
-                return Err(Invalid::Range { field, value, expected: "at most 1e18" });
-            }
-        }
-        if self.radius_max < self.radius_min {
-            let expected = "at least radius_min";
-            return Err(Invalid::Range { field: "radius_max", value: self.radius_max, expected });
-        }
+        site::check(self.position, self.normal, self.radius, self.radius_bounds())?;
         let [xx, xy, yy] = self.ellipse.map(f64::from);
         // A record reaches as far as R lets it at most, so an ellipse without end in some direction does no harm.
         if xx < 0.0 || yy < 0.0 || xy * xy > xx * yy * (1.0 + 1e-5) {
