@@ -186,7 +186,8 @@ mod tests {
             for l in 0..ORDER_MAX {
                 for m in -(l as isize)..=l as isize {
                     let value = harmonics::<COEFFICIENTS_MAX>(d)[(l * l + l).strict_add_signed(m)];
-                    let exact = if m == 0 { SCALE[l][0] * if d.z == 0.0 && l % 2 == 1 { -1.0 } else { 1.0 } } else { 0.0 };
+                    let exact =
+                        if m == 0 { SCALE[l][0] * if d.z == 0.0 && l % 2 == 1 { -1.0 } else { 1.0 } } else { 0.0 };
                     assert!((value - exact).abs() < 1e-12, "{d} {l} {m}: {value}");
                 }
             }

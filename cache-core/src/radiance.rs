@@ -26,8 +26,14 @@ pub type Coefficients<const N: usize> = [[f32; N]; 3];
 pub fn irradiance<const N: usize>(coefficients: &Coefficients<N>) -> Rgb {
     const { assert!(N > 1, "the cosine needs two bands") };
     // cos θ = √(2π)/2 H_0^0 + √(2π/3)/2 H_1^0.
-    const COSINE: [f32; 2] = [1.253_314_1, 0.723_601_25];
+    const COSINE: [f32; 2] = [1.253_314_1, 0.723_601_2];
     Rgb::from(coefficients.map(|c| COSINE[0] * c[0] + COSINE[1] * c[2]))
+}
+
+/// Radiance that a lobe of these coefficients reflects, W/(sr m²); may be negative where a sum rings.
+#[inline]
+pub fn reflected<const N: usize>(lobe: &[f32; N], incoming: &Coefficients<N>) -> Rgb {
+    Rgb::from(incoming.each_ref().map(|c| c.iter().zip(lobe).map(|(c, f)| c * f).sum()))
 }
 
 /// A record of incoming radiance.
@@ -202,5 +208,154 @@ impl<const N: usize> Radiance<N> {
             return Err(Invalid::Range { field: "noise", value: self.noise, expected: "0 or more" });
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::details::{Details, Weighting};
+    use crate::id::Random;
+    use crate::sealed::Sealed;
+
+    fn sound<const N: usize>(seed: u64) -> Radiance<N> {
+        let mut random = Random::named("radiance", &[seed]);
+        let mut next = || random.uniform();
+        let mut coefficients = || std::array::from_fn(|_| std::array::from_fn(|_| next() - 0.25));
+        Radiance {
+            id: RecordId(0x0123_4567_89ab_cdef_0011_2233_4455_6677 + u128::from(seed)),
+            position: Vec3::new(1.0, 2.0, 3.0),
+            normal: Vec3::Y,
+            radius: 2.0,
+            radius_min: 0.1,
+            radius_max: 10.0,
+            noise: 0.125,
+            coefficients: coefficients(),
+            gradient: [coefficients(), coefficients()],
+        }
+    }
+
+    fn packed<const N: usize>(record: &Radiance<N>) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        record.encode(&mut bytes);
+        bytes
+    }
+
+    fn survives<const N: usize>(kind: u32, size: usize) {
+        let bytes = packed(&sound::<N>(1));
+        assert_eq!((Radiance::<N>::KIND, Radiance::<N>::BYTES, bytes.len()), (kind, size, size));
+        assert_eq!(bytes[..4], [0x78, 0x66, 0x55, 0x44]);
+        assert_eq!(Radiance::<N>::decode(&bytes), Ok(sound(1)));
+        assert!(matches!(Radiance::<N>::decode(&bytes[1..]), Err(Invalid::Length { .. })));
+        // Memory holds no more than the wire.
+        assert_eq!(size_of::<Radiance<N>>(), size.next_multiple_of(8));
+    }
+
+    #[test]
+    fn records_survive_packing_and_have_the_size_stated() {
+        survives::<4>(18, 200);
+        survives::<16>(20, 632);
+        survives::<36>(22, 1352);
+        survives::<64>(24, 2360);
+        survives::<100>(26, 3656);
+    }
+
+    #[test]
+    fn unsound_records_are_refused_by_name() {
+        type Spoil = fn(&mut Radiance<16>);
+        let spoilt: [(&str, Spoil); 13] = [
+            ("position", |r| r.position.x = f32::NAN),
+            ("normal", |r| r.normal.z = f32::INFINITY),
+            ("normal", |r| r.normal = Vec3::new(0.0, 2.0, 0.0)),
+            ("radius", |r| r.radius = f32::INFINITY),
+            ("radius", |r| r.radius = 0.0),
+            ("radius", |r| r.radius = 1e-30),
+            ("radius_min", |r| r.radius_min = -1.0),
+            ("radius_max", |r| r.radius_max = 0.01),
+            ("noise", |r| r.noise = f32::NAN),
+            ("noise", |r| r.noise = -1.0),
+            ("coefficients", |r| r.coefficients[2][15] = f32::NAN),
+            ("gradient", |r| r.gradient[0][0][0] = f32::INFINITY),
+            ("gradient", |r| r.gradient[1][2][15] = f32::NEG_INFINITY),
+        ];
+        for (field, spoil) in spoilt {
+            let mut record = sound(1);
+            spoil(&mut record);
+            let message = Radiance::<16>::decode(&packed(&record)).expect_err(field).to_string();
+            assert!(message.contains(field), "{field}: {message}");
+        }
+    }
+
+    proptest! {
+        /// Whatever bytes come, what is read from them is sound and packs to the same.
+        #[test]
+        fn any_bytes_are_refused_or_sound(bytes in prop::collection::vec(any::<u8>(), 200), keep in 0usize..200) {
+            let mut mixed = packed(&sound::<4>(1));
+            mixed[keep..].copy_from_slice(&bytes[keep..]);
+            if let Ok(record) = Radiance::<4>::decode(&mixed) {
+                prop_assert_eq!(packed(&record), mixed);
+            }
+        }
+    }
+
+    /// Λ + d ∂Λ, then the rotation, then the weighted mean.
+    #[test]
+    fn interpolation_moves_turns_and_weighs() {
+        let frame = Frame::around(Vec3::Y);
+        let mut near = sound::<16>(1);
+        let far = Radiance { position: near.position + frame.x * 0.3, ..sound(2) };
+        near.noise = 0.25;
+        let mut sealed = Sealed::with(0.5, Details { neighbor_clamping: false, ..Details::default() });
+        sealed.extend([near, far]);
+        let query = Query { position: near.position + frame.x * 0.1 + frame.y * 0.2, normal: Vec3::Y };
+        let answer = sealed.ask(&query).expect("both count");
+        let weight = |r: &Radiance<16>| Weighting::InverseToZero.weight(r.error(&query, 2.0, 0.5), 0.5);
+        let [v, w] = [&near, &far].map(weight);
+        let moved = |r: &Radiance<16>, x: f32, y: f32, c: usize, i: usize| {
+            r.coefficients[c][i] + x * r.gradient[0][c][i] + y * r.gradient[1][c][i]
+        };
+        for (c, i) in (0..48).map(|i| (i / 16, i % 16)) {
+            let mean = (moved(&near, 0.1, 0.2, c, i) * v + moved(&far, -0.2, 0.2, c, i) * w) / (v + w);
+            assert!((answer.coefficients[c][i] - mean).abs() < 1e-5, "{c} {i}");
+        }
+        let noise = ((0.25 * v).powi(2) + (0.125 * w).powi(2)).sqrt() / (v + w);
+        assert_eq!(answer.records, 2);
+        assert!((answer.noise - noise).abs() < 1e-6);
+        // Seen from another normal, the same rotated; irradiance is that of the tilted hemisphere.
+        let mut alone = Sealed::new(0.5);
+        alone.extend([Radiance { gradient: [[[0.0; 16]; 3]; 2], ..near }]);
+        let tilted = Query { position: near.position, normal: Vec3::new(0.2, 1.0, 0.1).normalize() };
+        let answer = alone.ask(&tilted).expect("counts");
+        let mut expected = near.coefficients;
+        Rotation::between(&frame, &Frame::around(tilted.normal)).apply(&mut expected);
+        let off = answer.coefficients.iter().flatten().zip(expected.iter().flatten()).map(|(a, b)| (a - b).abs());
+        assert!(off.fold(0.0, f32::max) < 1e-5);
+    }
+
+    #[test]
+    fn a_record_counts_no_farther_than_rotations_are_known() {
+        let at = |degrees: f32| {
+            let (s, c) = degrees.to_radians().sin_cos();
+            let query = Query { position: sound::<4>(1).position, normal: Vec3::new(s, c, 0.0) };
+            sound::<4>(1).error(&query, 2.0, 10.0)
+        };
+        assert!((at(60.0) - 0.5f32.sqrt()).abs() < 1e-5);
+        assert!(at(68.0).is_finite() && at(70.0) == f32::INFINITY);
+    }
+
+    /// The furnace, whose every answer is the same, from any record at any normal.
+    #[test]
+    fn a_furnace_answers_the_same_everywhere() {
+        let mut lit = Radiance { gradient: [[[0.0; 36]; 3]; 2], coefficients: [[0.0; 36]; 3], ..sound::<36>(1) };
+        lit.coefficients.iter_mut().for_each(|c| c[0] = std::f32::consts::TAU.sqrt());
+        let mut sealed = Sealed::new(0.8);
+        sealed.extend([lit, Radiance { id: RecordId(9), normal: Vec3::new(0.6, 0.8, 0.0), ..lit }]);
+        for x in [0.0, 0.2, 0.5] {
+            let answer = sealed.ask(&Query { position: lit.position, normal: Vec3::new(x, 1.0, x).normalize() });
+            let light = irradiance(&answer.expect("counts").coefficients);
+            assert!((light - std::f32::consts::PI).abs().max_element() < 1e-5, "{light}");
+        }
     }
 }

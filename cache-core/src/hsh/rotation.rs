@@ -229,7 +229,7 @@ mod tests {
         }
         let mirrored = |j: usize| {
             // Y_l^m(x, y, -z) = (-1)^(l + m) Y_l^m: what is odd vanishes, what is even counts twice.
-            let of = |l: usize| (l * l..(l + 1) * (l + 1)).map(move |i| (i, (i - l * l) % 2 == 0));
+            let of = |l: usize| (l * l..(l + 1) * (l + 1)).map(move |i| (i, (i - l * l).is_multiple_of(2)));
             let even = (0..bands).flat_map(of);
             even.map(|(i, even)| if even { 2.0 * conversion[i][j] } else { 0.0 }).collect::<Vec<_>>()
         };
@@ -303,7 +303,8 @@ mod tests {
             Rotation::between(&from, &to).apply(&mut seen);
             for d in [Vec3::new(0.1, 0.2, 0.9), Vec3::new(-0.5, 0.1, 0.8), Vec3::new(0.3, 0.6, 0.7)] {
                 let d = d.normalize();
-                let value: f64 = harmonics::<100>(d.as_dvec3()).iter().zip(seen[0]).map(|(h, c)| h * f64::from(c)).sum();
+                let value: f64 =
+                    harmonics::<100>(d.as_dvec3()).iter().zip(seen[0]).map(|(h, c)| h * f64::from(c)).sum();
                 let exact = light(from.to_local(to.to_world(d)).as_dvec3());
                 assert!((value - exact).abs() < 0.02 * exact, "{normal} {d}: {value} {exact}");
             }
@@ -350,7 +351,8 @@ mod tests {
             let (mut mirrored, mut dark, mut all) = (0.0, 0.0, 0.0);
             for _ in 0..20 {
                 // A sky of four bands, everywhere positive but for chance.
-                let sky: Vec<f64> = (0..16).map(|i| if i == 0 { 4.0 } else { f64::from(random.uniform()) - 0.5 }).collect();
+                let sky: Vec<f64> =
+                    (0..16).map(|i| if i == 0 { 4.0 } else { f64::from(random.uniform()) - 0.5 }).collect();
                 let light = |d: DVec3| sh::spherical(4, d).iter().zip(&sky).map(|(y, s)| y * s).sum::<f64>();
                 let mut sums = [[0.0; 36]; 3];
                 for (d, weight) in hemisphere(32) {
