@@ -104,25 +104,34 @@ static SCALE: LazyLock<[[f64; ORDER_MAX]; ORDER_MAX]> = LazyLock::new(|| {
     })
 });
 
-/// Nodes and weights of the Gauss-Legendre rule on [`low`, `high`].
-fn gauss(count: usize, low: f64, high: f64) -> impl Iterator<Item = (f64, f64)> + Clone {
-    let n = count as f64;
-    (0..count).map(move |i| {
-        let mut x = libm::cos(std::f64::consts::PI * (i as f64 + 0.75) / (n + 0.5));
-        let mut slope = 1.0;
-        // Newton; the start is good to some 1e-3, each step doubles the digits.
-        for _ in 0..5 {
-            let (mut before, mut value) = (1.0, x);
-            for k in 2..=count {
-                let k = k as f64;
-                (before, value) = (value, ((2.0 * k - 1.0) * x * value - (k - 1.0) * before) / k);
+/// A Gauss-Legendre rule: nodes and weights on [0, 1].
+struct Gauss(Vec<(f64, f64)>);
+
+impl Gauss {
+    fn new(count: usize) -> Self {
+        let n = count as f64;
+        let node = |i: usize| {
+            let mut x = libm::cos(std::f64::consts::PI * (i as f64 + 0.75) / (n + 0.5));
+            let mut slope = 1.0;
+            // Newton; the start is good to some 1e-3, each step doubles the digits.
+            for _ in 0..5 {
+                let (mut before, mut value) = (1.0, x);
+                for k in 2..=count {
+                    let k = k as f64;
+                    (before, value) = (value, ((2.0 * k - 1.0) * x * value - (k - 1.0) * before) / k);
+                }
+                slope = n * (x * value - before) / (x * x - 1.0);
+                x -= value / slope;
             }
-            slope = n * (x * value - before) / (x * x - 1.0);
-            x -= value / slope;
-        }
-        let half = (high - low) * 0.5;
-        (low + half * (1.0 - x), half * 2.0 / ((1.0 - x * x) * slope * slope))
-    })
+            ((1.0 - x) * 0.5, 1.0 / ((1.0 - x * x) * slope * slope))
+        };
+        Self((0..count).map(node).collect())
+    }
+
+    /// The rule on [`low`, `high`].
+    fn on(&self, low: f64, high: f64) -> impl Iterator<Item = (f64, f64)> {
+        self.0.iter().map(move |(x, weight)| (low + (high - low) * x, (high - low) * weight))
+    }
 }
 
 #[cfg(test)]
@@ -133,7 +142,7 @@ mod tests {
 
     /// Unit directions of the upper hemisphere with their solid angles: exact for products of two harmonics.
     pub(super) fn hemisphere(count: usize) -> impl Iterator<Item = (DVec3, f64)> {
-        gauss(count, 0.0, 1.0).flat_map(move |(z, weight)| {
+        Gauss::new(count).0.into_iter().flat_map(move |(z, weight)| {
             (0..2 * count).map(move |k| {
                 let phi = TAU * (k as f64 + 0.5) / (2 * count) as f64;
                 let s = (1.0 - z * z).sqrt();

@@ -8,7 +8,7 @@ use std::f64::consts::PI;
 
 use glam::{DVec3, Vec2, Vec3};
 
-use super::{COEFFICIENTS_MAX, ORDER_MAX, gauss, harmonics, order};
+use super::{COEFFICIENTS_MAX, Gauss, ORDER_MAX, harmonics, order};
 
 /// Tabulated outgoing elevations, evenly spaced in tan(θ/2) from the normal to the horizon (as parabolic maps are).
 const ROWS: usize = 65;
@@ -42,9 +42,10 @@ impl Lobe {
             })
             .collect();
         let mut sums = vec![([0.0; COEFFICIENTS_MAX], 0.0); ROWS];
-        for (z, height) in gauss(NODES, 0.0, 1.0) {
+        let rule = Gauss::new(NODES);
+        for (z, height) in rule.on(0.0, 1.0) {
             let s = (1.0 - z * z).sqrt();
-            for (phi, width) in gauss(NODES, 0.0, PI) {
+            for (phi, width) in rule.on(0.0, PI) {
                 let d = DVec3::new(s * libm::cos(phi), s * libm::sin(phi), z);
                 let h = harmonics::<COEFFICIENTS_MAX>(d);
                 for (outgoing, (coefficients, energy)) in outgoing.iter().zip(&mut sums) {

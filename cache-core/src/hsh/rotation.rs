@@ -4,11 +4,12 @@
 //! whose entries it is interpolated. Where the tilted hemisphere looks below the record's horizon nothing is known:
 //! there it sees what lies as far above it. So a furnace stays a furnace; Gautron's zeros would darken it.
 
+use std::f64::consts::PI;
 use std::sync::OnceLock;
 
 use glam::{DVec3, Vec2};
 
-use super::{ORDER_MAX, gauss, harmonics, order};
+use super::{Gauss, ORDER_MAX, harmonics, order};
 use crate::math::Frame;
 
 /// Greatest sqrt(1 - n·n_i) between two normals, some 69 degrees: beyond, one sees little of what the other saw.
@@ -19,6 +20,9 @@ const CHORD_MAX: f32 = TURN_MAX * std::f32::consts::SQRT_2;
 
 /// Tabulated tilts, beside none at all: denser at small ones, where harmonics steep at the horizon make entries bend.
 const STEPS: usize = 48;
+
+/// Nodes of the rule a tilt is integrated by, along each piece of the hemisphere that no edge crosses.
+const NODES: usize = 24;
 
 /// From one tangent frame to another.
 #[derive(Clone, Copy, Debug)]
@@ -88,16 +92,18 @@ struct Blocks {
 fn tilts<const N: usize>() -> &'static Tilts {
     static TILTS: [OnceLock<Tilts>; ORDER_MAX] = [const { OnceLock::new() }; ORDER_MAX];
     TILTS[const { order(N) } - 1].get_or_init(|| {
-        let parts = parts(const { order(N) });
-        let [mut even, mut odd] = parts.map(|index| Blocks { index, matrices: Vec::new() });
+        let [even, odd] = parts(const { order(N) });
+        let mut tilts = Tilts {
+            even: Blocks { index: even, matrices: Vec::new() },
+            odd: Blocks { index: odd, matrices: Vec::new() },
+        };
+        let rule = Gauss::new(NODES);
         for step in 0..=STEPS {
-            let matrix = tilt::<N>(f64::from(CHORD_MAX) * (step * step) as f64 / (STEPS * STEPS) as f64);
-            for part in [&mut even, &mut odd] {
-                let columns = part.index.iter().flat_map(|j| part.index.iter().map(|i| matrix[*j][*i] as f32));
-                part.matrices.extend(columns.collect::<Vec<_>>());
-            }
+            let [even, odd] = tilt::<N>(&rule, f64::from(CHORD_MAX) * (step * step) as f64 / (STEPS * STEPS) as f64);
+            tilts.even.matrices.extend(even.iter().map(|v| *v as f32));
+            tilts.odd.matrices.extend(odd.iter().map(|v| *v as f32));
         }
-        Tilts { even, odd }
+        tilts
     })
 }
 
@@ -143,37 +149,37 @@ impl Blocks {
     }
 }
 
-/// The tilt about y whose normals are `chord` apart, column by column: ∫ H_i(ω) H_j(R ω) dω, where R ω is mirrored at the
-/// horizon (after Gautron 2004 eq. 14). Good to 1e-6.
-fn tilt<const N: usize>(chord: f64) -> Vec<[f64; N]> {
-    /// Nodes along each piece that no edge crosses.
-    const NODES: usize = 24;
+/// The tilt about y whose normals are `chord` apart: ∫ H_i(ω) H_j(R ω) dω, where R ω is mirrored at the horizon (after
+/// Gautron 2004 eq. 14). Both parts, column by column.
+fn tilt<const N: usize>(rule: &Gauss, chord: f64) -> [Vec<f64>; 2] {
     let cos = 1.0 - chord * chord / 2.0;
     let sin = (1.0 - cos * cos).max(0.0).sqrt();
-    let mut columns = vec![[0.0; N]; N];
     let parts = parts(const { order(N) });
+    let mut matrices = parts.each_ref().map(|part| vec![0.0; part.len() * part.len()]);
     let mut node = |z: f64, phi: f64, weight: f64| {
         let s = (1.0 - z * z).max(0.0).sqrt();
         let d = DVec3::new(s * libm::cos(phi), s * libm::sin(phi), z);
         let seen = DVec3::new(cos * d.x + sin * d.z, d.y, (cos * d.z - sin * d.x).abs());
         let (rows, values) = (harmonics::<N>(d), harmonics::<N>(seen));
-        for part in &parts {
-            for j in part {
+        for (part, matrix) in parts.iter().zip(&mut matrices) {
+            let mut packed = [0.0; N];
+            packed.iter_mut().zip(part).for_each(|(row, i)| *row = rows[*i]);
+            for (column, j) in matrix.chunks_exact_mut(part.len()).zip(part) {
                 let value = values[*j] * weight;
-                part.iter().for_each(|i| columns[*j][*i] += rows[*i] * value);
+                column.iter_mut().zip(&packed).for_each(|(sum, row)| *sum += row * value);
             }
         }
     };
     // Half the hemisphere is enough, twice. Below the height `sin` the record's horizon crosses the circle.
-    for (z, weight) in gauss(NODES, sin, 1.0) {
-        gauss(NODES, 0.0, std::f64::consts::PI).for_each(|(phi, w)| node(z, phi, 2.0 * weight * w));
+    for (z, weight) in rule.on(sin, 1.0) {
+        rule.on(0.0, PI).for_each(|(phi, width)| node(z, phi, 2.0 * weight * width));
     }
-    for (z, weight) in gauss(NODES, 0.0, sin) {
+    for (z, weight) in rule.on(0.0, sin) {
         let edge = libm::acos((z * cos / ((1.0 - z * z).sqrt() * sin)).min(1.0));
-        gauss(NODES, 0.0, edge).for_each(|(phi, w)| node(z, phi, 2.0 * weight * w));
-        gauss(NODES, edge, std::f64::consts::PI).for_each(|(phi, w)| node(z, phi, 2.0 * weight * w));
+        rule.on(0.0, edge).for_each(|(phi, width)| node(z, phi, 2.0 * weight * width));
+        rule.on(edge, PI).for_each(|(phi, width)| node(z, phi, 2.0 * weight * width));
     }
-    columns
+    matrices
 }
 
 #[cfg(test)]
@@ -191,6 +197,27 @@ mod tests {
     fn noise<const N: usize>(seed: u64) -> [[f32; N]; 3] {
         let mut random = crate::id::Random::named("coefficients", &[seed]);
         std::array::from_fn(|_| std::array::from_fn(|_| random.uniform() - 0.5))
+    }
+
+    /// The tilt itself, whole.
+    fn exact<const N: usize>(nodes: usize, chord: f64) -> Vec<[f64; N]> {
+        let mut columns = vec![[0.0; N]; N];
+        for (part, matrix) in parts(order(N)).iter().zip(tilt::<N>(&Gauss::new(nodes), chord)) {
+            for (column, j) in matrix.chunks_exact(part.len()).zip(part) {
+                column.iter().zip(part).for_each(|(value, i)| columns[*j][*i] = *value);
+            }
+        }
+        columns
+    }
+
+    /// Less is lost there than by interpolation.
+    #[test]
+    fn tilts_are_integrated_by_nodes_enough() {
+        for chord in [0.01, 0.2, 0.7, f64::from(CHORD_MAX)] {
+            let error = distance(&exact::<100>(NODES, chord), &exact::<100>(3 * NODES, chord)).1;
+            eprintln!("order 10, tilt {:.1} degrees: integrated but for {error:.1e}", angle(chord).to_degrees());
+            assert!(error < 2e-3, "{error}");
+        }
     }
 
     /// Frobenius distance of two matrices over the norm of the second, and the longest difference of two columns: what is
@@ -245,7 +272,7 @@ mod tests {
     #[test]
     fn tilts_are_those_of_spherical_harmonics_with_many_bands() {
         for chord in [0.2, 0.7, f64::from(CHORD_MAX)] {
-            let exact = tilt::<16>(chord);
+            let exact = exact::<16>(NODES, chord);
             let errors = [6, 12, 24].map(|bands| distance(&by_spherical::<16>(bands, chord), &exact).0);
             eprintln!("tilt {:.1} degrees, order 4 by 6, 12, 24 bands: {errors:?}", angle(chord).to_degrees());
             assert!(errors[1] < errors[0] / 5.0 && errors[2] < errors[1] / 5.0, "{errors:?}");
@@ -257,7 +284,7 @@ mod tests {
         for i in 0..101 {
             // Between the steps too.
             let chord = f64::from(CHORD_MAX) * f64::from(i) / 100.0;
-            let (mean, column) = distance(&fast::<N>(chord), &tilt::<N>(chord));
+            let (mean, column) = distance(&fast::<N>(chord), &exact::<N>(2 * NODES, chord));
             worst = (worst.0.max(mean), worst.1.max(column));
         }
         eprintln!("order {}: fast tilt off by {:.1e} relative RMS, {:.1e} at worst", order(N), worst.0, worst.1);
