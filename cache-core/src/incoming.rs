@@ -11,6 +11,7 @@ use glam::{Vec2, Vec3};
 
 use crate::details::{Details, Gradients};
 use crate::hemisphere::{Sample, distance, variance};
+use crate::hsh::rotation::turn;
 use crate::hsh::{ORDER_MAX, harmonics, order, polar};
 use crate::math::{Rgb, sin_cos};
 use crate::radiance::{Coefficients, irradiance};
@@ -27,6 +28,29 @@ pub struct Estimate<const N: usize> {
     pub radius: f32,
     /// Standard error of each coefficient, root mean square over the channels, W/(√sr m²).
     pub noise: f32,
+}
+
+impl<const N: usize> Estimate<N> {
+    /// The same in a frame turned about the normal by an angle given as (cosine, sine).
+    pub fn turned(mut self, angle: Vec2) -> Self {
+        self.coefficients.iter_mut().chain(self.gradient.as_flattened_mut()).for_each(|c| turn(c, angle));
+        let [along_x, along_y] = &mut self.gradient;
+        for (x, y) in along_x.as_flattened_mut().iter_mut().zip(along_y.as_flattened_mut()) {
+            (*x, *y) = (*x * angle.x + *y * angle.y, *y * angle.x - *x * angle.y);
+        }
+        self
+    }
+
+    /// What two independent gathers at one site say together; `rays` is how many each of them traced. How far the record
+    /// reaches is for this one to say, which should be the larger.
+    pub fn united(mut self, rays: f32, other: &Self, others: f32) -> Self {
+        let (own, theirs) = (rays / (rays + others), others / (rays + others));
+        let all = self.coefficients.iter_mut().chain(self.gradient.as_flattened_mut()).flatten();
+        let others = other.coefficients.iter().chain(other.gradient.as_flattened()).flatten();
+        all.zip(others).for_each(|(a, b)| *a = *a * own + b * theirs);
+        self.noise = ((self.noise * own).powi(2) + (other.noise * theirs).powi(2)).sqrt();
+        self
+    }
 }
 
 /// The cells of a hemisphere.

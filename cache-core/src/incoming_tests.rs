@@ -188,3 +188,38 @@ fn the_noise_told_is_the_noise_met() {
     let ratio = (told / met).sqrt();
     assert!((ratio - 1.0).abs() < 0.1, "{ratio}");
 }
+
+/// A gather whose frame is turned by some sectors has the same samples in other places.
+#[test]
+fn a_turned_frame_tells_the_same() {
+    let cells = Cells::new(1000);
+    let (n, turn) = (cells.sectors.len(), 5);
+    let own = samples(&cells, 1, lamp, Vec3::ZERO);
+    let angle = cells.sectors[turn].border[1];
+    let turned: Vec<_> = (0..own.len())
+        .map(|i| {
+            let sample = own[i / n * n + (i + turn) % n];
+            let around = Vec2::new(angle.x, -angle.y).rotate(Vec2::new(sample.direction.x, sample.direction.y));
+            Sample { direction: around.extend(sample.direction.z), ..sample }
+        })
+        .collect();
+    let own: Estimate<36> = cells.estimate(&own, &Details::default());
+    let other: Estimate<36> = cells.estimate(&turned, &Details::default());
+    let own = own.turned(angle);
+    assert!(off(&other.coefficients[0], &own.coefficients[0]) < 1e-5);
+    assert!(off(&other.gradient[0][0], &own.gradient[0][0]) < 1e-5);
+    assert!(off(&other.gradient[1][0], &own.gradient[1][0]) < 1e-5);
+}
+
+#[test]
+fn two_gathers_together_count_by_their_rays() {
+    let (one, other) = (gather::<16>(300, 1, lamp, Vec3::ZERO), gather::<16>(100, 2, lamp, Vec3::ZERO));
+    let both = one.united(300.0, &other, 100.0);
+    let mean = |a: f32, b: f32| 0.75 * a + 0.25 * b;
+    for i in 0..16 {
+        assert!((both.coefficients[1][i] - mean(one.coefficients[1][i], other.coefficients[1][i])).abs() < 1e-6);
+        assert!((both.gradient[1][0][i] - mean(one.gradient[1][0][i], other.gradient[1][0][i])).abs() < 1e-6);
+    }
+    assert!((both.noise.powi(2) - mean(0.75 * one.noise.powi(2), 0.25 * other.noise.powi(2))).abs() < 1e-6);
+    assert_eq!(both.radius, one.radius);
+}
