@@ -63,7 +63,7 @@ pub struct Radiance<const N: usize> {
 /// What a query of radiance gets.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Answer<const N: usize> {
-    /// Incoming radiance along the axes of `Frame::around` the query's normal, W/(√sr m²).
+    /// Incoming radiance along the axes of `Frame::around` the query's shading normal, W/(√sr m²).
     pub coefficients: Coefficients<N>,
     /// How many records answered.
     pub records: u32,
@@ -101,7 +101,8 @@ impl<const N: usize> Cached for Radiance<N> {
         }
     }
 
-    /// A summand of Krivanek 2005 eq. 12: R_i (Λ_i + d_x ∂Λ_i/∂x + d_y ∂Λ_i/∂y).
+    /// A summand of Krivanek 2005 eq. 12: R_i (Λ_i + d_x ∂Λ_i/∂x + d_y ∂Λ_i/∂y); R_i turns to the shading normal, so that bumps
+    /// cost no records.
     #[inline]
     fn add(&self, query: &Query, weight: f32, limit: f32, answer: &mut Answer<N>) {
         let frame = Frame::around(self.normal);
@@ -113,8 +114,8 @@ impl<const N: usize> Cached for Radiance<N> {
                 moved[i] = (moved[i] + shift.x * along_x[i] + shift.y * along_y[i]) * weight;
             }
         }
-        if query.normal != self.normal {
-            Rotation::between(&frame, &Frame::around(query.normal)).apply(&mut moved);
+        if query.shading != self.normal {
+            Rotation::between(&frame, &Frame::around(query.shading)).apply(&mut moved);
         }
         for (sum, moved) in answer.coefficients.iter_mut().zip(&moved) {
             sum.iter_mut().zip(moved).for_each(|(sum, moved)| *sum += moved);
@@ -309,7 +310,7 @@ mod tests {
         near.noise = 0.25;
         let mut sealed = Sealed::with(0.5, Details { neighbor_clamping: false, ..Details::default() });
         sealed.extend([near, far]);
-        let query = Query { position: near.position + frame.x * 0.1 + frame.y * 0.2, normal: Vec3::Y };
+        let query = Query::new(near.position + frame.x * 0.1 + frame.y * 0.2, Vec3::Y);
         let answer = sealed.ask(&query).expect("both count");
         let weight = |r: &Radiance<16>| Weighting::InverseToZero.weight(r.error(&query, 2.0, 0.5), 0.5);
         let [v, w] = [&near, &far].map(weight);
@@ -323,22 +324,27 @@ mod tests {
         let noise = ((0.25 * v).powi(2) + (0.125 * w).powi(2)).sqrt() / (v + w);
         assert_eq!(answer.records, 2);
         assert!((answer.noise - noise).abs() < 1e-6);
-        // Seen from another normal, the same rotated; irradiance is that of the tilted hemisphere.
+        // Seen from another normal, the same rotated.
         let mut alone = Sealed::new(0.5);
         alone.extend([Radiance { gradient: [[[0.0; 16]; 3]; 2], ..near }]);
-        let tilted = Query { position: near.position, normal: Vec3::new(0.2, 1.0, 0.1).normalize() };
-        let answer = alone.ask(&tilted).expect("counts");
+        let shading = Vec3::new(0.2, 1.0, 0.1).normalize();
         let mut expected = near.coefficients;
-        Rotation::between(&frame, &Frame::around(tilted.normal)).apply(&mut expected);
-        let off = answer.coefficients.iter().flatten().zip(expected.iter().flatten()).map(|(a, b)| (a - b).abs());
-        assert!(off.fold(0.0, f32::max) < 1e-5);
+        Rotation::between(&frame, &Frame::around(shading)).apply(&mut expected);
+        // A bump costs nothing, a bend of the surface an error.
+        let bump = Query { shading, ..Query::new(near.position, Vec3::Y) };
+        for (query, error) in [(bump, 0.0), (Query::new(near.position, shading), 0.15)] {
+            assert!((near.error(&query, 2.0, 0.5) - error).abs() < 0.01);
+            let answer = alone.ask(&query).expect("counts");
+            let off = answer.coefficients.iter().flatten().zip(expected.iter().flatten()).map(|(a, b)| (a - b).abs());
+            assert!(off.fold(0.0, f32::max) < 1e-5);
+        }
     }
 
     #[test]
     fn a_record_counts_no_farther_than_rotations_are_known() {
         let at = |degrees: f32| {
             let (s, c) = degrees.to_radians().sin_cos();
-            let query = Query { position: sound::<4>(1).position, normal: Vec3::new(s, c, 0.0) };
+            let query = Query::new(sound::<4>(1).position, Vec3::new(s, c, 0.0));
             sound::<4>(1).error(&query, 2.0, 10.0)
         };
         assert!((at(60.0) - 0.5f32.sqrt()).abs() < 1e-5);
@@ -353,7 +359,7 @@ mod tests {
         let mut sealed = Sealed::new(0.8);
         sealed.extend([lit, Radiance { id: RecordId(9), normal: Vec3::new(0.6, 0.8, 0.0), ..lit }]);
         for x in [0.0, 0.2, 0.5] {
-            let answer = sealed.ask(&Query { position: lit.position, normal: Vec3::new(x, 1.0, x).normalize() });
+            let answer = sealed.ask(&Query::new(lit.position, Vec3::new(x, 1.0, x).normalize()));
             let light = irradiance(&answer.expect("counts").coefficients);
             assert!((light - std::f32::consts::PI).abs().max_element() < 1e-5, "{light}");
         }
