@@ -171,6 +171,71 @@ impl<const N: usize> Packed for Radiance<N> {
     }
 }
 
+/// A record of any order, field by field as [`Radiance`] has them: for those who read and write text.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Plain {
+    /// Identity.
+    pub id: RecordId,
+    /// Site, world.
+    pub position: Vec3,
+    /// Unit normal.
+    pub normal: Vec3,
+    /// R at birth.
+    pub radius: f32,
+    /// Least and greatest R it counts with.
+    pub radius_bounds: (f32, f32),
+    /// Standard error of each coefficient.
+    pub noise: f32,
+    /// Λ of each channel.
+    pub coefficients: [Vec<f32>; 3],
+    /// ∂Λ/∂x and ∂Λ/∂y of each channel.
+    pub gradient: [[Vec<f32>; 3]; 2],
+}
+
+impl<const N: usize> From<&Radiance<N>> for Plain {
+    fn from(r: &Radiance<N>) -> Self {
+        let channels = |c: &Coefficients<N>| c.each_ref().map(|c| c.to_vec());
+        Self {
+            id: r.id,
+            position: r.position,
+            normal: r.normal,
+            radius: r.radius,
+            radius_bounds: r.radius_bounds(),
+            noise: r.noise,
+            coefficients: channels(&r.coefficients),
+            gradient: r.gradient.each_ref().map(channels),
+        }
+    }
+}
+
+impl<const N: usize> TryFrom<&Plain> for Radiance<N> {
+    type Error = Invalid;
+
+    /// The record, unchecked but for the number of its coefficients.
+    fn try_from(plain: &Plain) -> Result<Self, Invalid> {
+        let channels = |c: &[Vec<f32>; 3]| -> Result<Coefficients<N>, Invalid> {
+            let mut channels = [[0.0; N]; 3];
+            for (channel, values) in channels.iter_mut().zip(c) {
+                let length = |_| Invalid::Length { expected: 4 * N, got: 4 * values.len() };
+                *channel = values.as_slice().try_into().map_err(length)?;
+            }
+            Ok(channels)
+        };
+        let [along_x, along_y] = &plain.gradient;
+        Ok(Self {
+            id: plain.id,
+            position: plain.position,
+            normal: plain.normal,
+            radius: plain.radius,
+            radius_min: plain.radius_bounds.0,
+            radius_max: plain.radius_bounds.1,
+            noise: plain.noise,
+            coefficients: channels(&plain.coefficients)?,
+            gradient: [channels(along_x)?, channels(along_y)?],
+        })
+    }
+}
+
 /// A record's kind on the wire less its order.
 const KIND_BASE: u32 = 16;
 

@@ -1,17 +1,114 @@
 //! A record of any kind: what logs hold.
 
+use std::any::Any;
+use std::fmt;
+use std::sync::Arc;
+
 use crate::cached::{Invalid, Packed};
 use crate::id::RecordId;
 use crate::irradiance::Irradiance;
+use crate::radiance::{Plain, Radiance};
 use crate::shrink::Shrink;
 
 /// A record of any kind.
-#[derive(Clone, Copy, PartialEq, Debug)]
+#[derive(Clone, PartialEq, Debug)]
 pub enum Record {
     /// Diffuse indirect light at a site.
     Irradiance(Irradiance),
     /// Another record should count less far.
     Shrink(Shrink),
+    /// Incoming radiance at a site, of any order.
+    Radiance(Ordered),
+}
+
+/// A record of radiance whose order its kind tells: some are thirty times as large as one of irradiance, so they are shared.
+#[derive(Clone)]
+pub struct Ordered(Arc<dyn Erased>);
+
+/// What is the same for all orders.
+trait Erased: Any + Send + Sync {
+    fn kind(&self) -> u32;
+    fn id(&self) -> RecordId;
+    fn encode(&self, bytes: &mut Vec<u8>);
+    fn check(&self) -> Result<(), Invalid>;
+    fn plain(&self) -> Plain;
+    fn text(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result;
+}
+
+impl<const N: usize> Erased for Radiance<N> {
+    fn kind(&self) -> u32 {
+        Self::KIND
+    }
+
+    fn id(&self) -> RecordId {
+        self.id
+    }
+
+    fn encode(&self, bytes: &mut Vec<u8>) {
+        Packed::encode(self, bytes);
+    }
+
+    fn check(&self) -> Result<(), Invalid> {
+        self.check()
+    }
+
+    fn plain(&self) -> Plain {
+        self.into()
+    }
+
+    fn text(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Debug::fmt(self, f)
+    }
+}
+
+impl Ordered {
+    /// The record, if it has N coefficients.
+    pub fn of<const N: usize>(&self) -> Option<&Radiance<N>> {
+        (&*self.0 as &dyn Any).downcast_ref()
+    }
+
+    /// The record field by field.
+    pub fn plain(&self) -> Plain {
+        self.0.plain()
+    }
+
+    fn bytes(&self) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        self.0.encode(&mut bytes);
+        bytes
+    }
+}
+
+impl PartialEq for Ordered {
+    fn eq(&self, other: &Self) -> bool {
+        self.0.kind() == other.0.kind() && self.bytes() == other.bytes()
+    }
+}
+
+impl fmt::Debug for Ordered {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.text(f)
+    }
+}
+
+/// Does `$work` with `$record` being the type of records of `$kind`; `None` for a kind this build does not know.
+macro_rules! of_kind {
+    ($kind:expr, $record:ident => $work:expr) => {
+        match $kind {
+            Irradiance::KIND => Some(of_kind!(@ Irradiance, $record => $work)),
+            Shrink::KIND => Some(of_kind!(@ Shrink, $record => $work)),
+            Radiance::<4>::KIND => Some(of_kind!(@ Radiance<4>, $record => $work)),
+            Radiance::<16>::KIND => Some(of_kind!(@ Radiance<16>, $record => $work)),
+            Radiance::<36>::KIND => Some(of_kind!(@ Radiance<36>, $record => $work)),
+            Radiance::<64>::KIND => Some(of_kind!(@ Radiance<64>, $record => $work)),
+            Radiance::<100>::KIND => Some(of_kind!(@ Radiance<100>, $record => $work)),
+            _ => None,
+        }
+    };
+    (@ $type:ty, $record:ident => $work:expr) => {{
+        type $record = $type;
+        $work
+    }};
 }
 
 impl Record {
@@ -20,6 +117,7 @@ impl Record {
         match self {
             Self::Irradiance(_) => Irradiance::KIND,
             Self::Shrink(_) => Shrink::KIND,
+            Self::Radiance(record) => record.0.kind(),
         }
     }
 
@@ -29,6 +127,7 @@ impl Record {
         match self {
             Self::Irradiance(record) => record.id,
             Self::Shrink(shrink) => shrink.id,
+            Self::Radiance(record) => record.0.id(),
         }
     }
 
@@ -37,6 +136,7 @@ impl Record {
         match self {
             Self::Irradiance(record) => record.encode(bytes),
             Self::Shrink(shrink) => shrink.encode(bytes),
+            Self::Radiance(record) => record.0.encode(bytes),
         }
     }
 
@@ -48,16 +148,32 @@ impl Record {
         match self {
             Self::Irradiance(record) => record.check(),
             Self::Shrink(shrink) => shrink.check(),
+            Self::Radiance(record) => record.0.check(),
         }
+    }
+
+    /// The record of radiance of these fields, checked.
+    ///
+    /// # Errors
+    /// What is unsound about it.
+    pub fn radiance(plain: &Plain) -> Result<Self, Invalid> {
+        let record = match plain.coefficients[0].len() {
+            4 => Radiance::<4>::try_from(plain)?.into(),
+            16 => Radiance::<16>::try_from(plain)?.into(),
+            36 => Radiance::<36>::try_from(plain)?.into(),
+            64 => Radiance::<64>::try_from(plain)?.into(),
+            100 => Radiance::<100>::try_from(plain)?.into(),
+            many => {
+                let expected = "4, 16, 36, 64 or 100 of each channel";
+                return Err(Invalid::Range { field: "coefficients", value: many as f32, expected });
+            }
+        };
+        Self::check(&record).map(|()| record)
     }
 
     /// Bytes of a packed record of a kind; `None` for a kind this build does not know.
     pub fn bytes(kind: u32) -> Option<usize> {
-        match kind {
-            Irradiance::KIND => Some(Irradiance::BYTES),
-            Shrink::KIND => Some(Shrink::BYTES),
-            _ => None,
-        }
+        of_kind!(kind, Kind => Kind::BYTES)
     }
 
     /// Reads and checks one record of a kind; `None` for a kind this build does not know.
@@ -65,11 +181,7 @@ impl Record {
     /// # Errors
     /// What is unsound about it.
     pub fn decode(kind: u32, bytes: &[u8]) -> Option<Result<Self, Invalid>> {
-        match kind {
-            Irradiance::KIND => Some(Irradiance::decode(bytes).map(Self::Irradiance)),
-            Shrink::KIND => Some(Shrink::decode(bytes).map(Self::Shrink)),
-            _ => None,
-        }
+        of_kind!(kind, Kind => Kind::decode(bytes).map(Self::from))
     }
 }
 
@@ -85,15 +197,29 @@ impl From<Shrink> for Record {
     }
 }
 
+impl<const N: usize> From<Radiance<N>> for Record {
+    fn from(record: Radiance<N>) -> Self {
+        Self::Radiance(Ordered(Arc::new(record)))
+    }
+}
+
 /// It is of another kind.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, thiserror::Error)]
 #[error("a record of another kind")]
 pub struct OtherKind;
 
-impl TryFrom<Record> for Irradiance {
+impl TryFrom<&Record> for Irradiance {
     type Error = OtherKind;
 
-    fn try_from(record: Record) -> Result<Self, OtherKind> {
-        if let Record::Irradiance(record) = record { Ok(record) } else { Err(OtherKind) }
+    fn try_from(record: &Record) -> Result<Self, OtherKind> {
+        if let Record::Irradiance(record) = record { Ok(*record) } else { Err(OtherKind) }
+    }
+}
+
+impl<const N: usize> TryFrom<&Record> for Radiance<N> {
+    type Error = OtherKind;
+
+    fn try_from(record: &Record) -> Result<Self, OtherKind> {
+        if let Record::Radiance(record) = record { record.of().copied().ok_or(OtherKind) } else { Err(OtherKind) }
     }
 }

@@ -147,13 +147,13 @@ impl<C: Cached> Sealed<C> {
     /// [`Self::extend`] and [`Self::shrink`] in one: what is of neither kind is left out.
     pub fn unite<'a>(&mut self, new: impl IntoIterator<Item = &'a Record>)
     where
-        C: TryFrom<Record>,
+        C: for<'r> TryFrom<&'r Record>,
     {
         let (mut records, mut shrinks) = (Vec::new(), Vec::new());
         for record in new {
             match record {
                 Record::Shrink(shrink) => shrinks.push(*shrink),
-                other => records.extend(C::try_from(*other).ok()),
+                other => records.extend(C::try_from(other).ok()),
             }
         }
         self.extend(records);

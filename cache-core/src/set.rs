@@ -147,7 +147,7 @@ impl RecordSet {
             Entry::Vacant(slot) => {
                 slot.insert(new);
                 self.steps.entry(tag.step).or_default().add(id);
-                self.log.push((tag, *record));
+                self.log.push((tag, record.clone()));
                 return Inserted::Added;
             }
             Entry::Occupied(slot) => slot,
@@ -166,7 +166,7 @@ impl RecordSet {
         self.steps.entry(tag.step).or_default().add(id);
         *slot.get_mut() = new;
         self.replaced.insert(new.at as usize);
-        self.log.push((tag, *record));
+        self.log.push((tag, record.clone()));
         Inserted::Replaced
     }
 

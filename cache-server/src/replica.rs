@@ -10,7 +10,7 @@ use std::ops::Range;
 use cache_core::id::Digest;
 use cache_core::set::Sum;
 use cache_core::{Namespace, Record, RecordSet, Tag};
-use cache_proto::convert::{self, BATCH_RECORDS_MAX, Checked};
+use cache_proto::convert::{self, Checked};
 use cache_proto::v1;
 use prost::Message as _;
 
@@ -234,7 +234,7 @@ impl Replica {
         let rest = self.since(namespace, position)?;
         let Some((tag, first)) = rest.first() else { return Ok(None) };
         let alike = |(t, record): &&(Tag, Record)| t == tag && record.kind() == first.kind();
-        let count = rest.iter().take(BATCH_RECORDS_MAX).take_while(alike).count();
+        let count = rest.iter().take(convert::batch_max(first.kind())).take_while(alike).count();
         let run = rest[..count].iter().map(|(_, record)| record);
         Ok(Some((count as u64, convert::pack(namespace, *tag, run))))
     }
@@ -290,7 +290,7 @@ impl Replica {
 
     /// The records of one level, replaced ones left out.
     pub fn level(&self, namespace: &Namespace, level: u32) -> Vec<Record> {
-        self.set(namespace).map_or(Vec::new(), |set| set.level(level).copied().collect())
+        self.set(namespace).map_or(Vec::new(), |set| set.level(level).cloned().collect())
     }
 
     /// The records of a namespace.

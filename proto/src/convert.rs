@@ -9,6 +9,14 @@ use crate::v1;
 /// Most records in one batch.
 pub const BATCH_RECORDS_MAX: usize = 4096;
 
+/// Most bytes of them: large records are fewer.
+const BATCH_BYTES_MAX: usize = BATCH_RECORDS_MAX * Irradiance::BYTES;
+
+/// Most records of a kind in one batch; 0 for a kind this build does not know.
+pub fn batch_max(kind: u32) -> usize {
+    Record::bytes(kind).map_or(0, |size| (BATCH_BYTES_MAX / size).min(BATCH_RECORDS_MAX))
+}
+
 /// Why a message was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum Malformed {
@@ -56,8 +64,13 @@ pub enum Malformed {
         got: f32,
     },
     /// More records than one batch may carry.
-    #[error("batch has {0} bytes of records, expected at most 4096 records")]
-    TooMany(usize),
+    #[error("batch has {got} bytes of records, expected at most {most} records")]
+    TooMany {
+        /// Bytes there were.
+        got: usize,
+        /// Records there may be.
+        most: usize,
+    },
     /// A record that is not sound.
     #[error("record {index} of the batch: {reason}")]
     Record {
@@ -92,13 +105,13 @@ pub fn digest_bytes(digest: Digest) -> prost::bytes::Bytes {
     prost::bytes::Bytes::copy_from_slice(&digest.0.to_le_bytes())
 }
 
-/// Packs records of one tag and kind. At most [`BATCH_RECORDS_MAX`] of them make a batch a server accepts.
-pub fn pack<'a, R: Into<Record> + Copy + 'a>(
+/// Packs records of one tag and kind. At most [`batch_max`] of them make a batch a server accepts.
+pub fn pack<'a, R: Into<Record> + Clone + 'a>(
     namespace: &Namespace,
     tag: Tag,
     records: impl IntoIterator<Item = &'a R>,
 ) -> v1::RecordBatch {
-    let mut records = records.into_iter().map(|record| -> Record { (*record).into() }).peekable();
+    let mut records = records.into_iter().map(|record| -> Record { record.clone().into() }).peekable();
     let kind = records.peek().map_or(Irradiance::KIND, Record::kind);
     let mut bytes = Vec::with_capacity(records.size_hint().0 * Record::bytes(kind).unwrap_or(0));
     for record in records {
@@ -124,8 +137,9 @@ pub fn unpack(batch: &v1::RecordBatch) -> Result<(Namespace, Tag, Vec<Record>), 
     if !(1..=64).contains(&batch.level) {
         return Err(Malformed::Level(batch.level));
     }
-    if batch.records.len() > BATCH_RECORDS_MAX * size {
-        return Err(Malformed::TooMany(batch.records.len()));
+    let most = batch_max(batch.kind);
+    if batch.records.len() > most * size {
+        return Err(Malformed::TooMany { got: batch.records.len(), most });
     }
     // Collecting results would not know how many come.
     let mut records = Vec::with_capacity(batch.records.len().div_ceil(size));

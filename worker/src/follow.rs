@@ -316,7 +316,7 @@ pub struct Kept {
 pub async fn insert(cache: &mut Cache, namespace: &Namespace, records: &[(Tag, Record)]) -> Result<Kept, Status> {
     let mut batches = Vec::new();
     for run in records.chunk_by(|a, b| (a.0, a.1.kind()) == (b.0, b.1.kind())) {
-        for part in run.chunks(convert::BATCH_RECORDS_MAX) {
+        for part in run.chunks(convert::batch_max(run[0].1.kind())) {
             let batch = convert::pack(namespace, part[0].0, part.iter().map(|(_, r)| r));
             batches.push(v1::InsertRequest { batch: Some(batch) });
         }

@@ -115,7 +115,7 @@ impl Replica {
 
     /// The record of an id.
     pub fn get(&self, id: RecordId) -> Option<Record> {
-        self.set.get(id).map(|(_, record)| *record)
+        self.set.get(id).map(|(_, record)| record.clone())
     }
 
     /// Takes a batch of the subscription whose first record stands at `position`; says where the next one begins. What
@@ -192,7 +192,7 @@ impl Replica {
     fn at(&self, end: usize, positions: impl Iterator<Item = usize>) -> Vec<(Tag, Record)> {
         let gone: HashSet<usize> = self.replaced.range(..end).map(|(_, earlier)| *earlier).collect();
         let log = self.set.since(0);
-        positions.filter(|at| !gone.contains(at)).map(|at| log[at]).collect()
+        positions.filter(|at| !gone.contains(at)).map(|at| log[at].clone()).collect()
     }
 
     /// Gives the log away, for an empty one of the next epoch.
@@ -204,7 +204,7 @@ impl Replica {
     /// Adds what another copy holds besides, in its order.
     pub fn unite(&mut self, other: &Self) {
         for (tag, record) in other.set.since(0) {
-            self.insert(*tag, *record);
+            self.insert(*tag, record.clone());
         }
     }
 
@@ -218,7 +218,7 @@ impl Replica {
             if self.replaced.contains_key(&at) || other.set.get(record.id()).is_some() {
                 continue;
             }
-            records.extend(self.set.get(record.id()));
+            records.extend(self.set.get(record.id()).cloned());
             if records.len() == most {
                 break;
             }
@@ -269,7 +269,7 @@ pub(crate) mod tests {
     pub(crate) fn server(entries: &[(Tag, Record)]) -> Vec<(Tag, Record)> {
         let mut set = RecordSet::default();
         for (tag, record) in entries {
-            set.insert(*tag, *record);
+            set.insert(*tag, record.clone());
         }
         set.since(0).to_vec()
     }
@@ -289,7 +289,7 @@ pub(crate) mod tests {
     /// Each id's last entry in a piece of the log, which is the one that counts.
     pub(crate) fn latest(log: &[(Tag, Record)]) -> Vec<(Tag, Record)> {
         let counts = |at: usize| log[at + 1..].iter().all(|(_, later)| later.id() != log[at].1.id());
-        (0..log.len()).filter(|at| counts(*at)).map(|at| log[at]).collect()
+        (0..log.len()).filter(|at| counts(*at)).map(|at| log[at].clone()).collect()
     }
 
     pub(crate) fn digest(records: &[(Tag, Record)]) -> Digest {
@@ -323,7 +323,7 @@ pub(crate) mod tests {
                     prop_assert_eq!(there.insert(tag, record), Inserted::Added);
                 }
                 for (tag, record) in others.next().unwrap_or_default() {
-                    there.insert(*tag, *record);
+                    there.insert(*tag, record.clone());
                 }
                 from = next;
             }
@@ -347,7 +347,7 @@ pub(crate) mod tests {
                 // Both look before either's records arrive.
                 let found = [(0, &aside), (1, &behind)].map(|(i, r)| (i, r.lacking(&there, from[i], most)));
                 for (i, (records, next)) in found.into_iter().filter_map(|(i, found)| Some((i, found?))) {
-                    records.iter().for_each(|(tag, record)| _ = there.insert(*tag, *record));
+                    records.iter().for_each(|(tag, record)| _ = there.insert(*tag, record.clone()));
                     (from[i], lacked) = (next, true);
                 }
             }

@@ -3,6 +3,7 @@
 
 use std::io::{self, BufRead, Read as _, Write};
 
+use cache_core::radiance::Plain;
 use cache_core::{Irradiance, Record, RecordId, Shrink, Tag};
 use cache_proto::convert::{self, Checked};
 use cache_proto::v1::entry::Entry as Kind;
@@ -29,6 +30,7 @@ enum Type {
 enum RecordKind {
     Irradiance,
     Shrink,
+    Radiance,
 }
 
 #[derive(Deserialize)]
@@ -74,6 +76,25 @@ struct ShrinkLine {
 
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+struct RadianceLine {
+    r#type: Type,
+    namespace: String,
+    kind: RecordKind,
+    level: u32,
+    step: u32,
+    id: String,
+    position: [f32; 3],
+    normal: [f32; 3],
+    radius: f32,
+    radius_min: f32,
+    radius_max: f32,
+    noise: f32,
+    coefficients: [Vec<f32>; 3],
+    gradient: [[Vec<f32>; 3]; 2],
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 struct LabelLine {
     r#type: Type,
     namespace: String,
@@ -115,6 +136,7 @@ pub fn write(out: &mut impl Write, entry: &Entry) -> io::Result<()> {
                 line(match record {
                     Record::Irradiance(r) => serde_json::to_vec(&irradiance_line(&namespace, tag, r)),
                     Record::Shrink(r) => serde_json::to_vec(&shrink_line(&namespace, tag, r)),
+                    Record::Radiance(r) => serde_json::to_vec(&radiance_line(&namespace, tag, r.plain())),
                 })
             })
         }
@@ -177,6 +199,12 @@ fn entry(line: &[u8]) -> Result<Entry, String> {
                     let line: ShrinkLine = parse(line)?;
                     let shrink = Shrink { id: id("id", &line.id)?, of: id("of", &line.of)?, a: line.a };
                     (line.namespace, Tag { level: line.level, step: line.step }, Record::from(shrink))
+                }
+                RecordKind::Radiance => {
+                    let line: RadianceLine = parse(line)?;
+                    let tag = Tag { level: line.level, step: line.step };
+                    let (namespace, plain) = radiance(line)?;
+                    (namespace, tag, Record::radiance(&plain).map_err(|invalid| invalid.to_string())?)
                 }
             };
             record.check().map_err(|invalid| invalid.to_string())?;
@@ -286,4 +314,38 @@ fn irradiance(line: &IrradianceLine) -> Result<Irradiance, String> {
         ellipse: line.ellipse,
         noise: line.noise,
     })
+}
+
+fn radiance_line(namespace: &str, tag: Tag, r: Plain) -> RadianceLine {
+    RadianceLine {
+        r#type: Type::Record,
+        namespace: namespace.into(),
+        kind: RecordKind::Radiance,
+        level: tag.level,
+        step: tag.step,
+        id: digits(r.id),
+        position: r.position.into(),
+        normal: r.normal.into(),
+        radius: r.radius,
+        radius_min: r.radius_bounds.0,
+        radius_max: r.radius_bounds.1,
+        noise: r.noise,
+        coefficients: r.coefficients,
+        gradient: r.gradient,
+    }
+}
+
+/// The namespace a line names, and its record.
+fn radiance(line: RadianceLine) -> Result<(String, Plain), String> {
+    let plain = Plain {
+        id: id("id", &line.id)?,
+        position: Vec3::from(line.position),
+        normal: Vec3::from(line.normal),
+        radius: line.radius,
+        radius_bounds: (line.radius_min, line.radius_max),
+        noise: line.noise,
+        coefficients: line.coefficients,
+        gradient: line.gradient,
+    };
+    Ok((line.namespace, plain))
 }

@@ -15,7 +15,7 @@ use std::path::Path;
 
 use cache_core::id::Digest;
 use cache_core::{Namespace, Record, RecordSet, Tag};
-use cache_proto::convert::{self, BATCH_RECORDS_MAX, Checked, Malformed};
+use cache_proto::convert::{self, Checked, Malformed};
 use cache_proto::v1;
 use cache_proto::v1::entry::Entry as Kind;
 
@@ -140,7 +140,7 @@ impl Archive {
             let mut records: Vec<_> = held(set).collect();
             records.sort_by_key(|(tag, record)| (*tag, record.kind(), record.id()));
             for run in records.chunk_by(|a, b| (a.0, a.1.kind()) == (b.0, b.1.kind())) {
-                for batch in run.chunks(BATCH_RECORDS_MAX) {
+                for batch in run.chunks(convert::batch_max(run[0].1.kind())) {
                     let records = batch.iter().map(|(_, record)| record);
                     each(Kind::Batch(convert::pack(namespace, batch[0].0, records)))?;
                 }
@@ -159,7 +159,7 @@ impl Archive {
         match checked {
             Checked::Batch(namespace, tag, records) => {
                 let set = self.replica.set(&namespace);
-                let here = |record: &Record| set.and_then(|set| set.get(record.id())) == Some(&(tag, *record));
+                let here = |record: &Record| set.and_then(|set| set.get(record.id())).is_some_and(|(held, known)| (*held, known) == (tag, record));
                 let new: Vec<_> = records.into_iter().filter(|record| !here(record)).collect();
                 let batch = (!new.is_empty()).then(|| convert::pack(&namespace, tag, &new));
                 batch.map(|batch| v1::Entry { entry: Some(Kind::Batch(batch)) })
