@@ -31,8 +31,8 @@ pub struct RenderArgs {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536),
           default_value_t = defaults::SPP)]
     pub spp: u32,
-    /// How indirect light is computed; auto is irradiance
-    #[arg(long, value_name = "M", value_parser = ["auto", "irradiance", "path"], default_value = "auto")]
+    /// How indirect light is computed: auto has records of radiance for gloss where they are as good as sampling it
+    #[arg(long, value_name = "M", value_parser = ["auto", "irradiance", "radiance", "path"], default_value = "auto")]
     pub method: String,
     /// Allowed interpolation error of a record (Ward 1988): smaller is slower and more accurate
     #[arg(long, value_name = "A", value_parser = allowed_error, default_value_t = defaults::A)]
@@ -148,7 +148,7 @@ impl RenderArgs {
             width,
             height,
             spp: self.spp,
-            method: Method::from_name(&self.method).unwrap_or(Method::Irradiance),
+            method: Method::from_name(&self.method).unwrap_or(Method::Auto),
             a: self.a,
             rays: self.rays,
             bounces: self.bounces,
@@ -263,7 +263,7 @@ mod tests {
         assert_eq!((settings.width, settings.height, settings.spp), (expected, defaults::HEIGHT, defaults::SPP));
         assert_eq!(
             (settings.method, settings.rays, settings.bounces),
-            (Method::Irradiance, defaults::RAYS, ALL_BOUNCES)
+            (Method::Auto, defaults::RAYS, ALL_BOUNCES)
         );
         assert_eq!(settings.camera.name, "front");
     }

@@ -431,8 +431,8 @@ fn every_bounce_in_a_furnace_adds_half_of_the_one_before() {
                 // Beside a corner, sampled light of the other wall is noisy where records leave nothing to weigh it with.
                 let (spp, pixel, mean) = match method {
                     Method::Path => (256, 0.03, 5e-4),
-                    Method::Irradiance if materials == 1 => (4, 5e-3, 2e-3),
-                    Method::Irradiance => (64, 0.5, 0.01),
+                    _ if materials == 1 => (4, 5e-3, 2e-3),
+                    _ => (64, 0.5, 0.01),
                 };
                 let settings = Settings { bounces, a: 0.3, rays: 2048, ..sized(camera.expect("view"), method, spp) };
                 let picture = render(cube(cuts, materials), settings);

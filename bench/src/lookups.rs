@@ -93,7 +93,7 @@ fn of_a_render() -> Vec<Irradiance> {
     let (scene, camera) = load("stairs.glb");
     let base = Settings { width: 256, height: 256, a: A, rays: 64, ..settings(camera, "one") };
     let levels = solo::fill(&Frame::new(scene, base), Order::Rounds);
-    levels[0].records().to_vec()
+    levels[0].irradiance.records().to_vec()
 }
 
 /// `count` records: copies of the room, each in its place of a square.

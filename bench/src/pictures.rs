@@ -42,7 +42,7 @@ pub fn run(mut asked: Vec<String>) -> Result<(), Box<dyn Error>> {
         for settings in ladder {
             let label = match settings.method {
                 Method::Path => format!("path --spp {}", settings.spp),
-                Method::Irradiance => format!("--rays {} --a {} --spp {}", settings.rays, settings.a, settings.spp),
+                _ => format!("--rays {} --a {} --spp {}", settings.rays, settings.a, settings.spp),
             };
             let frame = Frame::new(scene.clone(), settings);
             let start = Instant::now();

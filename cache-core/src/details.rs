@@ -100,6 +100,8 @@ pub struct Details {
     pub spacing: Spacing,
     /// Whether records shrink where they make visible steps (Krivanek 2006, 4).
     pub adaptive: bool,
+    /// Order of all records of radiance; `None`: what each material's lobes need (Krivanek 2005, 4.1).
+    pub order: Option<usize>,
 }
 
 impl Default for Details {
@@ -116,6 +118,7 @@ impl Default for Details {
             weighting: Weighting::InverseToZero,
             spacing: Spacing::Pixels,
             adaptive: false,
+            order: None,
         }
     }
 }

@@ -23,6 +23,24 @@ pub struct Sample {
     pub distance: f32,
 }
 
+/// A hemisphere cut into cells, one ray through each.
+pub trait Cells {
+    /// How many rays a gather traces.
+    fn rays(&self) -> usize;
+    /// Local unit direction (z along the normal) of cell `index`, jittered by `u` in [0, 1)². Cells of one ring follow each
+    /// other.
+    fn direction(&self, index: usize, u: Vec2) -> Vec3;
+}
+
+/// What the samples of a gather say.
+pub trait Estimated {
+    /// Standard error of what is estimated, root mean square over the channels.
+    fn noise(&self) -> f32;
+    /// What two independent gathers at one site say together; `rays` is how many each of them traced. How far the record
+    /// reaches is for this one to say, which should be the larger.
+    fn united(self, rays: f32, other: &Self, others: f32) -> Self;
+}
+
 /// What a whole gather says.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Estimate {
@@ -41,10 +59,12 @@ pub struct Estimate {
     pub noise: f32,
 }
 
-impl Estimate {
-    /// What two independent gathers at one site say together; `rays` is how many each of them traced. How far the record
-    /// reaches is for this one to say, which should be the larger.
-    pub fn united(self, rays: f32, other: &Self, others: f32) -> Self {
+impl Estimated for Estimate {
+    fn noise(&self) -> f32 {
+        self.noise
+    }
+
+    fn united(self, rays: f32, other: &Self, others: f32) -> Self {
         let (own, theirs) = (rays / (rays + others), others / (rays + others));
         let both = |a: [Vec2; 3], b: [Vec2; 3]| std::array::from_fn(|c| a[c] * own + b[c] * theirs);
         Self {
@@ -115,21 +135,6 @@ impl Strata {
             })
             .collect();
         Self { polar, azimuthal, rings, sectors }
-    }
-
-    /// How many rays a gather traces: M N.
-    pub fn rays(&self) -> usize {
-        self.polar * self.azimuthal
-    }
-
-    /// Local unit direction (z along the normal) of cell `index`, jittered by `u` in [0, 1)². Cells of one ring follow
-    /// each other.
-    pub fn direction(&self, index: usize, u: Vec2) -> Vec3 {
-        let (j, k) = (index / self.azimuthal, index % self.azimuthal);
-        let s2 = (j as f32 + u.x) / self.polar as f32;
-        let (sin_phi, cos_phi) = sin_cos((k as f32 + u.y) * (2.0 * PI / self.azimuthal as f32));
-        let s = s2.sqrt();
-        Vec3::new(s * cos_phi, s * sin_phi, (1.0 - s2).max(0.0).sqrt())
     }
 
     /// Sums the samples of all cells, in cell order.
@@ -218,6 +223,20 @@ impl Strata {
             }
         }
         sum
+    }
+}
+
+impl Cells for Strata {
+    fn rays(&self) -> usize {
+        self.polar * self.azimuthal
+    }
+
+    fn direction(&self, index: usize, u: Vec2) -> Vec3 {
+        let (j, k) = (index / self.azimuthal, index % self.azimuthal);
+        let s2 = (j as f32 + u.x) / self.polar as f32;
+        let (sin_phi, cos_phi) = sin_cos((k as f32 + u.y) * (2.0 * PI / self.azimuthal as f32));
+        let s = s2.sqrt();
+        Vec3::new(s * cos_phi, s * sin_phi, (1.0 - s2).max(0.0).sqrt())
     }
 }
 

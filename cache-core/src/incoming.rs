@@ -10,7 +10,7 @@ use std::f32::consts::TAU;
 use glam::{Vec2, Vec3};
 
 use crate::details::{Details, Gradients};
-use crate::hemisphere::{Sample, distance, variance};
+use crate::hemisphere::{Cells, Estimated, Sample, distance, variance};
 use crate::hsh::rotation::turn;
 use crate::hsh::{ORDER_MAX, harmonics, order, polar};
 use crate::math::{Rgb, sin_cos};
@@ -40,10 +40,14 @@ impl<const N: usize> Estimate<N> {
         }
         self
     }
+}
 
-    /// What two independent gathers at one site say together; `rays` is how many each of them traced. How far the record
-    /// reaches is for this one to say, which should be the larger.
-    pub fn united(mut self, rays: f32, other: &Self, others: f32) -> Self {
+impl<const N: usize> Estimated for Estimate<N> {
+    fn noise(&self) -> f32 {
+        self.noise
+    }
+
+    fn united(mut self, rays: f32, other: &Self, others: f32) -> Self {
         let (own, theirs) = (rays / (rays + others), others / (rays + others));
         let all = self.coefficients.iter_mut().chain(self.gradient.as_flattened_mut()).flatten();
         let others = other.coefficients.iter().chain(other.gradient.as_flattened()).flatten();
@@ -53,9 +57,9 @@ impl<const N: usize> Estimate<N> {
     }
 }
 
-/// The cells of a hemisphere.
+/// Cells of equal solid angle.
 #[derive(Clone, Debug)]
-pub struct Cells {
+pub struct Bands {
     polar: usize,
     rings: Vec<Ring>,
     sectors: Vec<Sector>,
@@ -79,7 +83,7 @@ struct Sector {
     border: [Vec2; ORDER_MAX],
 }
 
-impl Cells {
+impl Bands {
     /// Cells for at most `rays` rays (at least 4), N ≈ 4M.
     pub fn new(rays: u32) -> Self {
         let rays = rays.max(4) as usize;
@@ -107,22 +111,6 @@ impl Cells {
             border: multiples(k as f32 * sector_angle),
         };
         Self { polar, rings, sectors: (0..azimuthal).map(sector).collect() }
-    }
-
-    /// How many rays a gather traces: M N.
-    pub fn rays(&self) -> usize {
-        self.polar * self.sectors.len()
-    }
-
-    /// Local unit direction (z along the normal) of cell `index`, jittered by `u` in [0, 1)² (Krivanek 2005b eq. 1). Cells of
-    /// one ring follow each other.
-    pub fn direction(&self, index: usize, u: Vec2) -> Vec3 {
-        let azimuthal = self.sectors.len();
-        let (j, k) = (index / azimuthal, index % azimuthal);
-        let z = 1.0 - (j as f32 + u.x) / self.polar as f32;
-        let (sin_phi, cos_phi) = sin_cos((k as f32 + u.y) * (TAU / azimuthal as f32));
-        let s = (1.0 - z * z).max(0.0).sqrt();
-        Vec3::new(s * cos_phi, s * sin_phi, z)
     }
 
     /// Sums the samples of all cells, in cell order.
@@ -176,6 +164,22 @@ impl Cells {
             shift(&mut gradient, ring.side, moves);
         }
         gradient
+    }
+}
+
+/// Directions by Krivanek 2005b eq. 1.
+impl Cells for Bands {
+    fn rays(&self) -> usize {
+        self.polar * self.sectors.len()
+    }
+
+    fn direction(&self, index: usize, u: Vec2) -> Vec3 {
+        let azimuthal = self.sectors.len();
+        let (j, k) = (index / azimuthal, index % azimuthal);
+        let z = 1.0 - (j as f32 + u.x) / self.polar as f32;
+        let (sin_phi, cos_phi) = sin_cos((k as f32 + u.y) * (TAU / azimuthal as f32));
+        let s = (1.0 - z * z).max(0.0).sqrt();
+        Vec3::new(s * cos_phi, s * sin_phi, z)
     }
 }
 

@@ -24,7 +24,7 @@ fn furnace(_: Vec3, _: Vec3) -> (f32, f32) {
     (1.0, 2.0)
 }
 
-fn samples(cells: &Cells, seed: u64, world: World, from: Vec3) -> Vec<Sample> {
+fn samples(cells: &Bands, seed: u64, world: World, from: Vec3) -> Vec<Sample> {
     let mut random = Random::named("incoming", &[seed]);
     let mut sample = |i| {
         let direction = cells.direction(i, Vec2::new(random.uniform(), random.uniform()));
@@ -35,7 +35,7 @@ fn samples(cells: &Cells, seed: u64, world: World, from: Vec3) -> Vec<Sample> {
 }
 
 fn gather<const N: usize>(rays: u32, seed: u64, world: World, from: Vec3) -> Estimate<N> {
-    let cells = Cells::new(rays);
+    let cells = Bands::new(rays);
     cells.estimate(&samples(&cells, seed, world, from), &Details::default())
 }
 
@@ -104,7 +104,7 @@ fn coefficients_and_derivatives_agree_with_finite_differences() {
 }
 
 /// The formula as printed: harmonics where the samples lie.
-fn printed<const N: usize>(cells: &Cells, samples: &[Sample]) -> [[f32; N]; 2] {
+fn printed<const N: usize>(cells: &Bands, samples: &[Sample]) -> [[f32; N]; 2] {
     let n = cells.sectors.len();
     let mut sum = [[0.0; N]; 2];
     let mut add = |along: Vec2, here: &Sample, beside: &Sample, speed: f32| {
@@ -128,7 +128,7 @@ fn printed<const N: usize>(cells: &Cells, samples: &[Sample]) -> [[f32; N]; 2] {
 fn harmonics_where_borders_move_come_nearer_than_as_printed() {
     for (name, world) in [("lamp", lamp as World), ("half-lit sphere", half_lit_sphere)] {
         let (_, [x, _]) = exact::<36>(world);
-        let cells = Cells::new(1000);
+        let cells = Bands::new(1000);
         let (mut own, mut other) = (0.0, 0.0);
         for seed in 0..50 {
             let samples = samples(&cells, seed, world, Vec3::ZERO);
@@ -169,7 +169,7 @@ fn irradiance_of_the_coefficients_is_that_of_a_gather_of_its_own() {
 /// What coefficients of many gathers scatter by, with samples that are noisy themselves.
 #[test]
 fn the_noise_told_is_the_noise_met() {
-    let cells = Cells::new(400);
+    let cells = Bands::new(400);
     let estimates: Vec<Estimate<16>> = (0..400u64)
         .map(|seed| {
             let mut random = Random::named("noise", &[seed]);
@@ -192,7 +192,7 @@ fn the_noise_told_is_the_noise_met() {
 /// A gather whose frame is turned by some sectors has the same samples in other places.
 #[test]
 fn a_turned_frame_tells_the_same() {
-    let cells = Cells::new(1000);
+    let cells = Bands::new(1000);
     let (n, turn) = (cells.sectors.len(), 5);
     let own = samples(&cells, 1, lamp, Vec3::ZERO);
     let angle = cells.sectors[turn].border[1];

@@ -22,18 +22,25 @@ use crate::site;
 /// Coefficients of each colour channel.
 pub type Coefficients<const N: usize> = [[f32; N]; 3];
 
+/// Coefficients of cos θ at (0, 0) and (1, 0): √(2π)/2 and √(2π/3)/2. All others are 0.
+pub const COSINE: [f32; 2] = [1.253_314_1, 0.723_601_2];
+
 /// E of incoming radiance, W/m²: exact, the cosine is the sum of two harmonics.
 pub fn irradiance<const N: usize>(coefficients: &Coefficients<N>) -> Rgb {
     const { assert!(N > 1, "the cosine needs two bands") };
-    // cos θ = √(2π)/2 H_0^0 + √(2π/3)/2 H_1^0.
-    const COSINE: [f32; 2] = [1.253_314_1, 0.723_601_2];
     Rgb::from(coefficients.map(|c| COSINE[0] * c[0] + COSINE[1] * c[2]))
 }
 
 /// Radiance that a lobe of these coefficients reflects, W/(sr m²); may be negative where a sum rings.
 #[inline]
-pub fn reflected<const N: usize>(lobe: &[f32; N], incoming: &Coefficients<N>) -> Rgb {
-    Rgb::from(incoming.each_ref().map(|c| c.iter().zip(lobe).map(|(c, f)| c * f).sum()))
+pub fn reflected<const N: usize>(lobe: &Coefficients<N>, incoming: &Coefficients<N>) -> Rgb {
+    let dot = |c: usize| lobe[c].iter().zip(&incoming[c]).map(|(f, l)| f * l).sum();
+    Rgb::new(dot(0), dot(1), dot(2))
+}
+
+/// How far an error of each coefficient reaches what such a lobe reflects, 1/√sr; root mean square over the channels.
+pub fn gain<const N: usize>(lobe: &Coefficients<N>) -> f32 {
+    (lobe.as_flattened().iter().map(|f| f * f).sum::<f32>() * (1.0 / 3.0)).sqrt()
 }
 
 /// A record of incoming radiance.
@@ -132,7 +139,7 @@ impl<const N: usize> Cached for Radiance<N> {
 }
 
 impl<const N: usize> Packed for Radiance<N> {
-    const KIND: u32 = KIND_BASE + order(N) as u32;
+    const KIND: u32 = kind(order(N));
     const BYTES: usize = 16 + 4 * (HEAD + 9 * N);
 
     fn id(&self) -> RecordId {
@@ -238,6 +245,11 @@ impl<const N: usize> TryFrom<&Plain> for Radiance<N> {
 
 /// A record's kind on the wire less its order.
 const KIND_BASE: u32 = 16;
+
+/// Kind on the wire of records of an order.
+pub const fn kind(order: usize) -> u32 {
+    KIND_BASE + order as u32
+}
 
 /// Floats between the id and the coefficients.
 const HEAD: usize = 10;

@@ -5,6 +5,7 @@ use std::fmt;
 use std::sync::Arc;
 
 use crate::cached::{Invalid, Packed};
+use crate::hsh::order;
 use crate::id::RecordId;
 use crate::irradiance::Irradiance;
 use crate::radiance::{Plain, Radiance};
@@ -28,6 +29,7 @@ pub struct Ordered(Arc<dyn Erased>);
 /// What is the same for all orders.
 trait Erased: Any + Send + Sync {
     fn kind(&self) -> u32;
+    fn order(&self) -> usize;
     fn id(&self) -> RecordId;
     fn encode(&self, bytes: &mut Vec<u8>);
     fn check(&self) -> Result<(), Invalid>;
@@ -38,6 +40,10 @@ trait Erased: Any + Send + Sync {
 impl<const N: usize> Erased for Radiance<N> {
     fn kind(&self) -> u32 {
         Self::KIND
+    }
+
+    fn order(&self) -> usize {
+        order(N)
     }
 
     fn id(&self) -> RecordId {
@@ -65,6 +71,11 @@ impl Ordered {
     /// The record, if it has N coefficients.
     pub fn of<const N: usize>(&self) -> Option<&Radiance<N>> {
         (&*self.0 as &dyn Any).downcast_ref()
+    }
+
+    /// The order of its coefficients.
+    pub fn order(&self) -> usize {
+        self.0.order()
     }
 
     /// The record field by field.

@@ -329,7 +329,7 @@ mod tests {
                 let tag = Tag { level: 1, step: *step };
                 // More than are looked up together.
                 let part: Vec<_> = part.iter().cycle().take(3 * part.len()).map(|r| Record::from(*r)).collect();
-                let took = part.iter().filter(|r| singly.insert(tag, **r) == Inserted::Replaced).map(Record::id);
+                let took = part.iter().filter(|r| singly.insert(tag, Record::clone(r)) == Inserted::Replaced).map(Record::id);
                 let took: Vec<_> = took.collect();
                 prop_assert_eq!(at_once.extend(tag, &part), took);
             }
@@ -343,7 +343,7 @@ mod tests {
             let mut far = union(&[&a]);
             let near = union(&[&a, &b]);
             for (tag, record) in near.since(far.position()) {
-                far.insert(*tag, *record);
+                far.insert(*tag, record.clone());
             }
             prop_assert_eq!(content(&far), content(&near));
         }

@@ -1,8 +1,8 @@
 use std::collections::BTreeSet;
-use std::sync::{Arc, OnceLock};
+use std::sync::OnceLock;
 use std::time::Duration;
 
-use cache_core::{Namespace, Sealed};
+use cache_core::Namespace;
 use cache_proto::v1;
 use cache_proto::v1::frame_event::Event;
 use cache_server::access::Tenant;
@@ -13,6 +13,7 @@ use cache_server::replica::Mark;
 use cache_server::spec::Job;
 use glam::{Vec2, Vec3};
 use prost::Message as _;
+use worker::levels::Level;
 use worker::scene::{Material, Scene, Triangle};
 use worker::settings::Settings;
 
@@ -188,7 +189,7 @@ fn rendered(spec: &v1::FrameSpec) {
     let settings = Settings { spp: 1, rays: settings.rays.min(64), bounces: settings.bounces.min(2), ..settings };
     let few = settings.width.min(8) * settings.height.min(8);
     let frame = worker::frame::Frame::new(room(), Settings { width: few, height: few, ..settings });
-    let mut levels: Vec<_> = (0..frame.levels()).map(|_| Arc::new(Sealed::new(frame.settings().a))).collect();
+    let mut levels: Vec<_> = (0..frame.levels()).map(|_| Level::new(frame.settings().a, frame.settings().details)).collect();
     for level in (1..=frame.levels()).rev() {
         // The fifth pass refines.
         for pass in [0, 4] {
@@ -196,7 +197,7 @@ fn rendered(spec: &v1::FrameSpec) {
             for record in &records {
                 assert_eq!(record.check(), Ok(()));
             }
-            Arc::make_mut(&mut levels[level as usize - 1]).unite(&records);
+            levels[level as usize - 1].unite(&records);
         }
     }
     drop(frame.pixels(0, &levels));

@@ -5,13 +5,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
+use cache_core::details::Details;
 use cache_core::id::{Digest, Origin, Random};
 use cache_core::rounds::{Plan, Step, refines};
-use cache_core::{Irradiance, Namespace, Query, Record, RecordId, Sealed, Shrink, Tag};
+use cache_core::{Irradiance, Namespace, Query, Record, RecordId, Shrink, Tag};
 use cache_proto::{convert, v1};
 use glam::{Vec2, Vec3};
-use worker::frame::Levels;
 use worker::job::{Job, Known, Work};
+use worker::levels::{Level, Levels};
 use worker::task::Done;
 
 use crate::events;
@@ -122,7 +123,7 @@ impl MadeUp {
             return Vec::new();
         }
         let sites = (0..4).flat_map(|pass| self.sites(*level, pass, ranks.start, tile));
-        let at = |position| levels[*level as usize - 1].contributions(&Query::new(position, Vec3::Z));
+        let at = |position| levels[*level as usize - 1].irradiance.contributions(&Query::new(position, Vec3::Z));
         let a = A * (0.5 + 0.4 * Random::named("a", &[digest(levels).0 as u64, tile.into()]).uniform());
         let shrinks: BTreeSet<_> = sites.flat_map(at).map(|near| near.record.id).collect();
         shrinks.into_iter().map(|of| Shrink::new(of, a).into()).collect()
@@ -134,7 +135,7 @@ impl MadeUp {
         let (sealed, read) = (&levels[*level as usize - 1], digest(levels));
         let (mut records, mut found) = (Vec::new(), 0);
         for position in self.sites(*level, *pass, ranks.start, tile) {
-            if sealed.covers(&Query::new(position, Vec3::Z)) {
+            if sealed.irradiance.covers(&Query::new(position, Vec3::Z)) {
                 continue;
             }
             let site = position.to_array();
@@ -210,9 +211,9 @@ pub struct Reference {
 /// Renders a frame from a base, with nobody in between.
 pub fn reference(spec: &v1::FrameSpec, base: &[(Tag, Record)]) -> Reference {
     let frame = MadeUp::new(spec.clone()).expect("our own");
-    let mut levels: Levels = (0..spec.levels).map(|_| Arc::new(Sealed::new(spec.a))).collect();
+    let mut levels: Levels = (0..spec.levels).map(|_| Level::new(spec.a, Details::default())).collect();
     for (tag, record) in base {
-        Arc::make_mut(&mut levels[tag.level as usize - 1]).unite([record]);
+        levels[tag.level as usize - 1].unite([record]);
     }
     let nothing: Known = Arc::new(|_| None);
     let size = u64::from(spec.width) * u64::from(spec.height);
@@ -225,7 +226,7 @@ pub fn reference(spec: &v1::FrameSpec, base: &[(Tag, Record)]) -> Reference {
         // Two tiles may propose the same.
         let new: BTreeMap<_, _> = new.into_iter().map(|record| (record.id(), record)).collect();
         gathered.extend(new.keys());
-        Arc::make_mut(&mut levels[level as usize - 1]).unite(new.values());
+        levels[level as usize - 1].unite(new.values());
     }
     Reference { tiles: (0..frame.tiles()).map(|tile| frame.pixels(tile, &levels)).collect(), gathered }
 }

@@ -7,6 +7,7 @@
 use std::f32::consts::{FRAC_1_PI, PI};
 
 use glam::Vec3;
+use smallvec::{SmallVec, smallvec};
 
 use crate::math::{exp, ln, sin_cos};
 use crate::scene::{Material, Rgb, Surface};
@@ -43,6 +44,41 @@ enum Gloss {
         cover: f32,
         alpha: f32,
     },
+}
+
+/// A lobe that depends on roughness alone: gloss is a sum of these, each times a colour.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub enum Shape {
+    /// Ward's lobe of strength 1; bits of alpha.
+    Ward(u32),
+    /// A surface that reflects all light it meets head-on, and none at grazing angles; bits of alpha.
+    GgxFacing(u32),
+    /// The rest of a surface that reflects all light; bits of alpha.
+    GgxGrazing(u32),
+    /// What a coat takes at grazing angles from the base below it.
+    Taken,
+}
+
+impl Shape {
+    /// BRDF times cosine of the incoming direction, 1/sr.
+    pub fn value(self, outgoing: Vec3, incoming: Vec3) -> f32 {
+        if outgoing.z <= 0.0 || incoming.z <= 0.0 {
+            return 0.0;
+        }
+        let brdf = match self {
+            Self::Ward(alpha) => ward(f32::from_bits(alpha), outgoing, incoming),
+            Self::GgxFacing(alpha) => {
+                let half = (outgoing + incoming).normalize();
+                (1.0 - grazing(outgoing, half)) * ggx_lobe(f32::from_bits(alpha), outgoing, incoming, half)
+            }
+            Self::GgxGrazing(alpha) => {
+                let half = (outgoing + incoming).normalize();
+                grazing(outgoing, half) * ggx_lobe(f32::from_bits(alpha), outgoing, incoming, half)
+            }
+            Self::Taken => grazing(outgoing, (outgoing + incoming).normalize()) * FRAC_1_PI,
+        };
+        brdf * incoming.z
+    }
 }
 
 /// Which part of a BRDF is meant.
@@ -102,6 +138,33 @@ impl Bsdf {
         self.diffuse
     }
 
+    /// Albedo of what reflects to all directions alike: of a coated surface less than [`Self::diffuse`], by what the coat takes
+    /// whatever the angle.
+    pub fn flat(&self) -> Rgb {
+        match self.gloss {
+            Gloss::Ggx { f0, base, .. } => self.diffuse - base * f0.max_element(),
+            _ => self.diffuse,
+        }
+    }
+
+    /// Everything else but mirrors: the lobes it is the sum of, and their colours. The lobes are those of the material alone.
+    pub fn lobes(&self) -> SmallVec<[(Shape, Rgb); 3]> {
+        match self.gloss {
+            Gloss::None | Gloss::Mirror(_) => SmallVec::new(),
+            Gloss::Ward { rho, alpha } => smallvec![(Shape::Ward(alpha.to_bits()), rho)],
+            Gloss::Ggx { metal, metal_cover, f0, f90, base, cover, alpha } => {
+                let alpha = alpha.to_bits();
+                let facing = metal * metal_cover + f0 * cover;
+                let grazing = Rgb::splat(metal_cover + f90 * cover);
+                let mut lobes = smallvec![(Shape::GgxFacing(alpha), facing), (Shape::GgxGrazing(alpha), grazing)];
+                if cover > 0.0 {
+                    lobes.push((Shape::Taken, base * (f0.max_element() - f90)));
+                }
+                lobes
+            }
+        }
+    }
+
     /// Whether there is anything but a diffuse part.
     pub fn has_gloss(&self) -> bool {
         !matches!(self.gloss, Gloss::None)
@@ -115,20 +178,11 @@ impl Bsdf {
         }
         let gloss = match self.gloss {
             Gloss::None | Gloss::Mirror(_) => Rgb::ZERO,
-            Gloss::Ward { rho, alpha } => {
-                let sum = outgoing + incoming;
-                let (squared, tan2) = (sum.length_squared(), (sum.x * sum.x + sum.y * sum.y) / (sum.z * sum.z));
-                let z2 = sum.z * sum.z;
-                rho * (exp(-tan2 / (alpha * alpha)) * squared / (PI * alpha * alpha * z2 * z2))
-            }
+            Gloss::Ward { rho, alpha } => rho * ward(alpha, outgoing, incoming),
             Gloss::Ggx { metal, metal_cover, f0, f90, base, cover, alpha } => {
                 let half = (outgoing + incoming).normalize();
-                let grazing = {
-                    let c = 1.0 - outgoing.dot(half).clamp(0.0, 1.0);
-                    c * c * c * c * c
-                };
-                let lobe = ggx(alpha, half) * ggx_masking(alpha, outgoing) * ggx_masking(alpha, incoming)
-                    / (4.0 * outgoing.z * incoming.z);
+                let grazing = grazing(outgoing, half);
+                let lobe = ggx_lobe(alpha, outgoing, incoming, half);
                 let coat = f0 + (Rgb::splat(f90) - f0) * grazing;
                 let metal = metal + (Rgb::ONE - metal) * grazing;
                 (metal * metal_cover + coat * cover) * lobe - base * (coat.max_element() * FRAC_1_PI)
@@ -222,6 +276,25 @@ fn cosine_direction(u: f32, v: f32) -> Vec3 {
 
 fn reflect(outgoing: Vec3, half: Vec3) -> Vec3 {
     half * (2.0 * outgoing.dot(half)) - outgoing
+}
+
+/// Ward's lobe of strength 1, 1/sr.
+fn ward(alpha: f32, outgoing: Vec3, incoming: Vec3) -> f32 {
+    let sum = outgoing + incoming;
+    let (squared, tan2) = (sum.length_squared(), (sum.x * sum.x + sum.y * sum.y) / (sum.z * sum.z));
+    let z2 = sum.z * sum.z;
+    exp(-tan2 / (alpha * alpha)) * squared / (PI * alpha * alpha * z2 * z2)
+}
+
+/// Schlick's share of light that is reflected for grazing angles' sake.
+fn grazing(outgoing: Vec3, half: Vec3) -> f32 {
+    let c = 1.0 - outgoing.dot(half).clamp(0.0, 1.0);
+    c * c * c * c * c
+}
+
+/// Trowbridge-Reitz lobe without Fresnel, 1/sr.
+fn ggx_lobe(alpha: f32, outgoing: Vec3, incoming: Vec3, half: Vec3) -> f32 {
+    ggx(alpha, half) * ggx_masking(alpha, outgoing) * ggx_masking(alpha, incoming) / (4.0 * outgoing.z * incoming.z)
 }
 
 /// Half vector of Ward's lobe: tan² δ = -α² ln u.
@@ -344,6 +417,19 @@ mod tests {
                 sum += bsdf.sample(a, Part::All, u).map_or(Rgb::ZERO, |s| s.weight) / 1e5;
             }
             assert!(sum.max_element() < 1.01, "{name}: {sum}");
+        }
+    }
+
+    /// What records are asked for is the BRDF.
+    #[test]
+    fn lobes_and_the_flat_part_are_all_that_is_reflected() {
+        for (name, bsdf) in models() {
+            for (wo, wi) in [(outgoing(0.3), outgoing(-0.8)), (outgoing(1.2), Vec3::new(-0.5, 0.3, 0.8).normalize())] {
+                let lobes = bsdf.lobes().into_iter().map(|(shape, color)| color * shape.value(wo, wi)).sum::<Rgb>();
+                let (diffuse, gloss) = bsdf.eval(wo, wi);
+                let (sum, all) = (lobes + bsdf.flat() * FRAC_1_PI * wi.z, (diffuse + gloss) * wi.z);
+                assert!((sum - all).abs().max_element() < 1e-5, "{name}: {sum} {all}");
+            }
         }
     }
 

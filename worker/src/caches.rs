@@ -1,12 +1,12 @@
 //! The sealed caches of exactly the records that a step of a frame may read.
 
 use std::collections::HashSet;
-use std::sync::Arc;
 
+use cache_core::RecordId;
+use cache_core::details::Details;
 use cache_core::id::Digest;
-use cache_core::{RecordId, Sealed};
 
-use crate::frame::Levels;
+use crate::levels::{Level, Levels};
 use crate::replica::{Mark, Part, ReplicaError};
 
 /// The caches of one frame: its base, and its draft's records of lower steps.
@@ -28,7 +28,7 @@ impl Caches {
     /// Empty caches that count with the allowed error `a`, one for each of `levels` levels. Records of deeper levels,
     /// which another client may have shared, go into none.
     pub fn new(a: f32, levels: u32) -> Self {
-        let levels = (0..levels).map(|_| Arc::new(Sealed::new(a))).collect();
+        let levels = (0..levels).map(|_| Level::new(a, Details::default())).collect();
         Self { a, levels, base: HashSet::new(), mark: Mark::default(), digest: Digest::default() }
     }
 
@@ -64,10 +64,7 @@ impl Caches {
     fn file(&mut self, part: &Part) {
         for (level, sealed) in (1..).zip(&mut self.levels) {
             let own = part.records.iter().filter(|(tag, r)| tag.level == level && !self.base.contains(&r.id()));
-            let mut own = own.map(|(_, record)| record).peekable();
-            if own.peek().is_some() {
-                Arc::make_mut(sealed).unite(own);
-            }
+            sealed.unite(own.map(|(_, record)| record));
         }
     }
 }
@@ -96,7 +93,7 @@ mod tests {
         points
             .flat_map(|position| {
                 let query = Query::new(position, Vec3::Z);
-                levels.iter().map(move |l| l.ask(&query).map(|a| a.irradiance.to_array().map(f32::to_bits)))
+                levels.iter().map(move |l| l.irradiance.ask(&query).map(|a| a.irradiance.to_array().map(f32::to_bits)))
             })
             .collect()
     }
@@ -107,10 +104,10 @@ mod tests {
 
     /// Two levels of these records.
     fn sealed(records: impl IntoIterator<Item = (Tag, Record)>) -> Levels {
-        let mut levels: Levels = (0..2).map(|_| Arc::new(Sealed::new(0.8))).collect();
+        let mut levels: Levels = (0..2).map(|_| Level::new(0.8, Details::default())).collect();
         for (tag, record) in records {
             if let Some(sealed) = levels.get_mut(tag.level as usize - 1) {
-                Arc::make_mut(sealed).unite([&record]);
+                sealed.unite([&record]);
             }
         }
         levels
@@ -152,7 +149,7 @@ mod tests {
                 }
                 let levels = caches.extend(&part, digest(&lower)).expect("same records");
                 let own = lower.into_iter().filter(|(_, r)| base.iter().all(|(_, b)| b.id() != r.id()));
-                let expected = sealed(base.iter().copied().chain(own));
+                let expected = sealed(base.iter().cloned().chain(own));
                 prop_assert_eq!(answers(&levels), answers(&expected));
                 prop_assert_eq!(counts(&levels), counts(&expected));
             }

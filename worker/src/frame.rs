@@ -1,20 +1,22 @@
 //! One frame as a worker sees it: the scene ready to trace, and the two kinds of work it leases.
 
 use std::ops::Range;
-use std::sync::Arc;
 
 use cache_core::details::Spacing;
 use cache_core::hemisphere::Strata;
 use cache_core::id::Random;
-use cache_core::{Irradiance, Namespace, Record, RecordId, Sealed, rounds};
+use cache_core::incoming::Bands;
+use cache_core::{Namespace, Record, RecordId, rounds};
 
 use crate::bsdf::Part;
 use crate::gather::{Gather, Rays, Site};
+use crate::levels::{Level, Levels};
 use crate::lights::Lights;
+use crate::lobes::{Lobes, Served};
 use crate::pixel::{Pixel, deviations};
 use crate::refine::Proposals;
 use crate::sampler::Sampler;
-use crate::scene::{Rgb, Scene};
+use crate::scene::Scene;
 use crate::settings::{Method, Settings};
 use crate::task::CpuClock;
 use crate::trace::Tracer;
@@ -61,9 +63,6 @@ const FIRST_SAMPLES: u32 = 4;
 /// Rays gathered for a sample of a pixel that no record covers, as a fraction of the least of a record, or of a quarter of those
 /// that are the same everywhere: its pixel's other samples share the error.
 const MISSED_RAYS: f32 = 0.25;
-
-/// The sealed records of every level; `[0]` is level 1. Cheap to clone.
-pub type Levels = Vec<Arc<Sealed<Irradiance>>>;
 
 /// What was counted while working, for the statistics.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -166,31 +165,37 @@ impl Counts {
 pub struct Frame {
     world: World,
     lights: Lights,
+    lobes: Lobes,
     settings: Settings,
     namespace: Namespace,
-    /// Cells of a gather at level 1, at deeper ones, and for a sample of a pixel that no record covers.
+    /// Cells of a gather of irradiance at level 1, at deeper ones, and for a sample of a pixel that no record covers.
     strata: [Strata; 3],
-    /// Cells of gathers that trace as many rays as light varies.
+    /// Cells of gathers of irradiance that trace as many rays as light varies.
     ladder: Vec<Strata>,
+    /// The same for radiance, at level 1.
+    bands: Vec<Bands>,
 }
 
 impl Frame {
     /// Builds what rendering needs.
     pub fn new(scene: Scene, settings: Settings) -> Self {
-        Self::of(World::new(scene), settings)
+        let lobes = Lobes::new(&scene.materials, settings.method, settings.details.order);
+        Self::of(World::new(scene), lobes, settings)
     }
 
-    fn of(world: World, settings: Settings) -> Self {
+    fn of(world: World, lobes: Lobes, settings: Settings) -> Self {
         let namespace = settings.namespace(&world.scene.hash);
         let lights = Lights::new(&world, settings.method != Method::Path);
         let missed = settings.effort.map_or(settings.rays / 4, |effort| effort.least_rays);
         let share = |of: u32, part: f32| Strata::new((of as f32 * part) as u32);
         let strata = [share(settings.rays, 1.0), share(settings.rays, DEEPER_RAYS), share(missed, MISSED_RAYS)];
-        let ladder = settings.effort.map_or_else(Vec::new, |effort| {
+        let rungs: Vec<_> = settings.effort.map_or_else(Vec::new, |effort| {
             let rungs = std::iter::successors(Some(effort.least_rays), |rays| rays.checked_mul(2));
-            rungs.take_while(|rays| *rays <= settings.rays.max(effort.least_rays)).map(Strata::new).collect()
+            rungs.take_while(|rays| *rays <= settings.rays.max(effort.least_rays)).collect()
         });
-        Self { world, lights, settings, namespace, strata, ladder }
+        let ladder = rungs.iter().copied().map(Strata::new).collect();
+        let bands = if rungs.is_empty() { vec![settings.rays] } else { rungs }.into_iter().map(Bands::new).collect();
+        Self { world, lights, lobes, settings, namespace, strata, ladder, bands }
     }
 
     /// The settings it was made with.
@@ -213,13 +218,15 @@ impl Frame {
         let s = &self.settings;
         match s.method {
             Method::Path => 0,
-            Method::Irradiance => s.bounces.saturating_add(self.lights.any_gathered().into()).min(LEVELS_MAX),
+            Method::Irradiance | Method::Radiance | Method::Auto => {
+                s.bounces.saturating_add(self.lights.any_gathered().into()).min(LEVELS_MAX)
+            }
         }
     }
 
-    /// The same scene with other settings.
+    /// The same scene and method with other settings.
     pub fn with(self, settings: Settings) -> Self {
-        Self::of(self.world, settings)
+        Self::of(self.world, self.lobes, settings)
     }
 
     /// Tests the candidates of `tile` whose ranks lie in `ranks` and gathers a record of `level` where the sealed
@@ -236,22 +243,24 @@ impl Frame {
     ) -> (Vec<Record>, Counts) {
         let mut counts = Counts::default();
         let adaptive = self.settings.details.adaptive && level == 1;
-        let own = sealed.get(level as usize - 1).filter(|own| !own.is_empty());
+        let own: Option<&Level> = sealed.get(level as usize - 1).filter(|own| !own.is_empty());
         let tracer = self.tracer(sealed);
         let (mut uncovered, mut proposals) = (Vec::new(), Proposals::default());
         let (clock, mut tested) = (CpuClock::start(), 0);
         for [x, y] in self.settings.pixels(tile).filter(|[x, y]| ranks.contains(&rounds::rank(*x, *y))) {
             let Some(site) = self.site(level, pass, x, y, &mut counts) else { continue };
             tested += 1;
+            let (site, served) = site;
             let covered = match own {
                 Some(own) if adaptive && rounds::refines(level, pass) => {
-                    proposals.test(&tracer, &site, own, &mut counts)
+                    proposals.test(&tracer, &site, own, &served, &mut counts)
                 }
-                Some(own) => own.covers(&site.query()),
+                Some(own) => own.covers(&site.query(), &served),
                 None => false,
             };
             if !covered {
-                uncovered.push(site);
+                let first_a = own.filter(|_| adaptive).map(|own| own.first_a(&site.query(), &served));
+                uncovered.push((site, first_a));
             }
         }
         counts.test_seconds += clock.seconds();
@@ -263,22 +272,15 @@ impl Frame {
             uncovered.clear();
         }
         // The level being filled is no business of its own gathers.
-        let gather = Gather {
-            tracer: &tracer,
-            namespace: &self.namespace,
-            seed: self.settings.seed,
-            level,
-            rays: self.rays(level),
-            details: &self.settings.details,
-        };
+        let gather = self.gather(&tracer, level);
         let mut records = Vec::with_capacity(uncovered.len());
-        for site in &uncovered {
+        for (site, first_a) in &uncovered {
             let id = gather.id(site);
             let found = known(id);
             counts.reused += u64::from(found.is_some());
-            records.push(found.unwrap_or_else(|| gather.record(id, site, &mut counts).into()));
-            if let Some(own) = own.filter(|_| adaptive) {
-                proposals.begin(id, own.first_a(&site.query()), self.settings.a);
+            records.push(found.unwrap_or_else(|| gather.record(id, site, &mut counts)));
+            if let Some(first_a) = first_a {
+                proposals.begin(id, *first_a, self.settings.a);
             }
         }
         records.extend(proposals.take().map(Record::from));
@@ -291,22 +293,28 @@ impl Frame {
         pass > 0 || (rank - ranks.start) as f32 >= DENSE_FROM * ranks.len() as f32
     }
 
-    /// How many rays a record of a level is made of.
-    fn rays(&self, level: u32) -> Rays<'_> {
+    /// Makes records of a level.
+    fn gather<'a>(&'a self, tracer: &'a Tracer<'a>, level: u32) -> Gather<'a> {
         let deeper = level > 1;
-        match self.settings.effort {
-            None => Rays::Fixed(&self.strata[usize::from(deeper)]),
+        let (strata, bands) = match self.settings.effort {
+            None => (Rays::Fixed(&self.strata[usize::from(deeper)]), Rays::Fixed(&self.bands[0])),
             Some(effort) => {
-                let share = if deeper { DEEPER_EFFORT } else { 1.0 };
-                Rays::Varied { ladder: &self.ladder, per_deviation: effort.rays * share }
+                let per_deviation = effort.rays * if deeper { DEEPER_EFFORT } else { 1.0 };
+                (
+                    Rays::Varied { ladder: &self.ladder, per_deviation },
+                    Rays::Varied { ladder: &self.bands, per_deviation },
+                )
             }
-        }
+        };
+        let (namespace, seed, details) = (&self.namespace, self.settings.seed, &self.settings.details);
+        Gather { tracer, namespace, seed, level, strata, bands, details }
     }
 
     pub(crate) fn tracer<'a>(&'a self, levels: &'a Levels) -> Tracer<'a> {
         let cached = self.settings.method != Method::Path;
         let bounces = self.settings.bounces;
-        Tracer { world: &self.world, lights: &self.lights, levels, bounces, cached, looks: 1, regather: None }
+        let (world, lights, lobes) = (&self.world, &self.lights, &self.lobes);
+        Tracer { world, lights, lobes, levels, bounces, cached, looks: 1, regather: None }
     }
 
     /// Traces samples of pixels that are as many as light varies.
@@ -314,8 +322,15 @@ impl Frame {
         Tracer { looks: if self.lights.any_sampled() { LOOKS } else { 1 }, ..self.tracer(levels) }
     }
 
-    /// The candidate of a pixel: the diffuse surface where a path through it has its `level`th meeting.
-    pub(crate) fn site(&self, level: u32, pass: u32, x: u32, y: u32, counts: &mut Counts) -> Option<Site> {
+    /// The candidate of a pixel: the surface where a path through it has its `level`th meeting, and which records serve it.
+    pub(crate) fn site(
+        &self,
+        level: u32,
+        pass: u32,
+        x: u32,
+        y: u32,
+        counts: &mut Counts,
+    ) -> Option<(Site, Served<'_>)> {
         let s = &self.settings;
         let look = rounds::look(level, pass);
         let name = [s.seed, x.into(), y.into(), level.into(), look.into()];
@@ -334,6 +349,8 @@ impl Frame {
                     return None;
                 }
                 let at = at.flattened();
+                let outgoing = at.frame.to_local(-direction);
+                let served = self.lobes.serve(self.world.material(&at), &bsdf, outgoing, level)?;
                 let deeper = usize::from(level > 1);
                 let pixels = (REACH_MIN_HEIGHT[deeper] * s.height as f32).max(REACH_MIN_PIXELS[deeper]);
                 let reach = match s.details.spacing {
@@ -350,8 +367,8 @@ impl Frame {
                     Spacing::World | Spacing::Free => 4.0 * self.world.radius,
                 };
                 let radius_bounds = (radius_min, radius_max.max(radius_min));
-                let reflectance = bsdf.diffuse().element_sum() * (1.0 / 3.0);
-                return (bsdf.diffuse() != Rgb::ZERO).then_some(Site { at, direction, radius_bounds, reflectance });
+                let order = if let Served::Gloss(order, _) = served { Some(order) } else { None };
+                return Some((Site { at, direction, radius_bounds, order, gain: served.gain() }, served));
             }
             let [a, b, c, _] = sampler.next4();
             let scatter = bsdf.sample(at.frame.to_local(-direction), Part::All, [a, b, c])?;

@@ -1,11 +1,13 @@
-//! A record of irradiance is made: stratified rays from a site, each bringing back what it sees where it lands.
+//! A record is made: stratified rays from a site, each bringing back what it sees where it lands.
+
+use std::f32::consts::SQRT_2;
 
 use cache_core::details::Details;
-use cache_core::hemisphere::{Estimate, Strata};
+use cache_core::hemisphere::{self, Cells, Estimated, Sample, Strata};
 use cache_core::id::{Origin, Random};
+use cache_core::incoming::Bands;
 use cache_core::math::Frame;
-use cache_core::{Irradiance, Namespace, Packed as _, Query, RecordId};
-use std::f32::consts::SQRT_2;
+use cache_core::{Irradiance, Namespace, Packed as _, Query, Radiance, Record, RecordId, radiance};
 
 use glam::{Vec2, Vec3};
 
@@ -29,19 +31,20 @@ pub struct Site {
     pub direction: Vec3,
     /// Least and greatest R of the record, world lengths.
     pub radius_bounds: (f32, f32),
-    /// Diffuse reflectance, mean of the channels.
-    pub reflectance: f32,
+    /// Order of the record of radiance that is wanted; `None`: one of irradiance.
+    pub order: Option<usize>,
+    /// Deviation of reflected radiance, W/(sr m²), per deviation of the record.
+    pub gain: f32,
 }
 
 /// How many rays a gather traces.
-#[derive(Clone, Copy)]
-pub enum Rays<'a> {
+pub enum Rays<'a, C> {
     /// One for each of these cells.
-    Fixed(&'a Strata),
+    Fixed(&'a C),
     /// As many as their variance asks for: first those of the first cells, then those of others of the ladder.
     Varied {
         /// Cells, each set of twice as many as the one before.
-        ladder: &'a [Strata],
+        ladder: &'a [C],
         /// Rays per W/(sr m²) by which reflected radiance would deviate with one ray.
         per_deviation: f32,
     },
@@ -64,8 +67,10 @@ pub struct Gather<'a> {
     pub seed: u64,
     /// Level of the record.
     pub level: u32,
-    /// Cells of the hemisphere.
-    pub rays: Rays<'a>,
+    /// Cells of the hemisphere for irradiance.
+    pub strata: Rays<'a, Strata>,
+    /// The same for radiance.
+    pub bands: Rays<'a, Bands>,
     /// What its samples become.
     pub details: &'a Details,
 }
@@ -79,7 +84,7 @@ impl Gather<'_> {
         let key = [position.x, position.y, position.z, normal.x, normal.y, normal.z, radius_min, radius_max];
         let origin = Origin {
             namespace: self.namespace,
-            kind: Irradiance::KIND,
+            kind: site.order.map_or(Irradiance::KIND, radiance::kind),
             level: self.level,
             site: &key,
             seed: self.seed,
@@ -89,37 +94,30 @@ impl Gather<'_> {
     }
 
     /// Makes the record `id` of a site: the same record, bit for bit, whoever makes it and when.
-    pub fn record(&self, id: RecordId, site: &Site, counts: &mut Counts) -> Irradiance {
-        let (radius_min, radius_max) = site.radius_bounds;
-        let mut random = Random::of(id);
-        // A turn of the strata about the normal, so that neighbouring records do not err alike.
-        let frame = turned(site.at.frame, random.uniform());
-        let mut sampler = Sampler::Stream(random);
-        let mut estimate = |strata: &Strata| {
-            let samples = self.tracer.hemisphere(&site.at, frame, self.level, strata, &mut sampler, counts);
-            strata.estimate(&samples, self.details)
-        };
-        let estimate = match self.rays {
-            Rays::Fixed(strata) => estimate(strata),
-            Rays::Varied { ladder, per_deviation } => {
-                let first = estimate(&ladder[0]);
-                let have = ladder[0].rays() as f32;
-                let deviation = first.noise * have.sqrt() * std::f32::consts::FRAC_1_PI * site.reflectance;
-                match ladder.iter().rev().find(|s| s.rays() as f32 <= per_deviation * deviation * SQRT_2) {
-                    Some(strata) => estimate(strata).united(strata.rays() as f32, &first, have),
-                    None => first,
-                }
-            }
-        };
-        let radius = estimate.radius.clamp(f32::MIN_POSITIVE, 4.0 * self.tracer.world.radius);
+    pub fn record(&self, id: RecordId, site: &Site, counts: &mut Counts) -> Record {
+        match site.order {
+            None => self.irradiance(id, site, counts).into(),
+            Some(2) => self.radiance::<4>(id, site, counts).into(),
+            Some(4) => self.radiance::<16>(id, site, counts).into(),
+            Some(6) => self.radiance::<36>(id, site, counts).into(),
+            Some(8) => self.radiance::<64>(id, site, counts).into(),
+            Some(_) => self.radiance::<100>(id, site, counts).into(),
+        }
+    }
+
+    /// Makes a record of irradiance.
+    fn irradiance(&self, id: RecordId, site: &Site, counts: &mut Counts) -> Irradiance {
+        let sum = |strata: &Strata, samples: &[Sample]| strata.estimate(samples, self.details);
+        let (estimate, frame) = self.estimate(id, site, &self.strata, sum, counts);
+        let (radius, radius_min) = self.radius(site, estimate.radius);
         let own = |v: Vec2| site.at.frame.tangential(frame.x * v.x + frame.y * v.y);
         Irradiance {
             id,
             position: site.at.position,
             normal: site.at.normal(),
             radius,
-            radius_min: radius_min.min(STRETCH * radius),
-            radius_max,
+            radius_min,
+            radius_max: site.radius_bounds.1,
             // A coat's share is negative: by noise a dark sum can be, too.
             irradiance: estimate.irradiance.max(Vec3::ZERO),
             gradient_t: estimate.gradient_t.map(own),
@@ -128,11 +126,68 @@ impl Gather<'_> {
             noise: estimate.noise,
         }
     }
+
+    /// Makes a record of radiance.
+    fn radiance<const N: usize>(&self, id: RecordId, site: &Site, counts: &mut Counts) -> Radiance<N> {
+        let sum = |bands: &Bands, samples: &[Sample]| bands.estimate::<N>(samples, self.details);
+        let (estimate, frame) = self.estimate(id, site, &self.bands, sum, counts);
+        let (radius, radius_min) = self.radius(site, estimate.radius);
+        // From the gather's frame back to that of the site.
+        let turn = site.at.frame.tangential(frame.x) * Vec2::new(1.0, -1.0);
+        let estimate = estimate.turned(turn);
+        Radiance {
+            id,
+            position: site.at.position,
+            normal: site.at.normal(),
+            radius,
+            radius_min,
+            radius_max: site.radius_bounds.1,
+            noise: estimate.noise,
+            coefficients: estimate.coefficients,
+            gradient: estimate.gradient,
+        }
+    }
+
+    /// Gathers at a site, as often as its rays ask for; in which frame.
+    fn estimate<C: Cells, E: Estimated>(
+        &self,
+        id: RecordId,
+        site: &Site,
+        rays: &Rays<C>,
+        sum: impl Fn(&C, &[Sample]) -> E,
+        counts: &mut Counts,
+    ) -> (E, Frame) {
+        let mut random = Random::of(id);
+        // A turn of the cells about the normal, so that neighbouring records do not err alike.
+        let frame = turned(site.at.frame, random.uniform());
+        let mut sampler = Sampler::Stream(random);
+        let mut gather =
+            |cells: &C| sum(cells, &self.tracer.hemisphere(&site.at, frame, self.level, cells, &mut sampler, counts));
+        let estimate = match *rays {
+            Rays::Fixed(cells) => gather(cells),
+            Rays::Varied { ladder, per_deviation } => {
+                let first = gather(&ladder[0]);
+                let have = ladder[0].rays() as f32;
+                let deviation = first.noise() * have.sqrt() * site.gain;
+                match ladder.iter().rev().find(|c| c.rays() as f32 <= per_deviation * deviation * SQRT_2) {
+                    Some(cells) => gather(cells).united(cells.rays() as f32, &first, have),
+                    None => first,
+                }
+            }
+        };
+        (estimate, frame)
+    }
+
+    /// R of a record, and the least it counts with.
+    fn radius(&self, site: &Site, met: f32) -> (f32, f32) {
+        let radius = met.clamp(f32::MIN_POSITIVE, 4.0 * self.tracer.world.radius);
+        (radius, site.radius_bounds.0.min(STRETCH * radius))
+    }
 }
 
 impl Gather<'_> {
     /// The estimate's ellipse along the site's tangents, no axis shorter than the least R.
-    fn ellipse(&self, site: &Site, frame: Frame, estimate: &Estimate) -> [f32; 3] {
+    fn ellipse(&self, site: &Site, frame: Frame, estimate: &hemisphere::Estimate) -> [f32; 3] {
         let [xx, xy, yy] = estimate.ellipse;
         if xx + yy == 0.0 || !(xx + yy).is_finite() {
             return [0.0; 3];
@@ -191,17 +246,18 @@ mod tests {
         let picture = Picture::new(scene, Settings { rays: 64, ..Settings::new(camera, 8, 8) });
         let (levels, mut counts) = (Vec::new(), Counts::default());
         let site = picture.site(1, 0, 4, 4, &mut counts).expect("the floor");
-        let site = Site { radius_bounds: (0.05, 0.4), ..site };
+        let site = Site { radius_bounds: (0.05, 0.4), ..site.0 };
         let strata = Strata::new(64);
         let gather = Gather {
             tracer: &picture.tracer(&levels),
             namespace: picture.namespace(),
             seed: 0,
             level: 1,
-            rays: Rays::Fixed(&strata),
+            strata: Rays::Fixed(&strata),
+            bands: Rays::Fixed(&Bands::new(64)),
             details: &picture.settings().details,
         };
-        gather.record(gather.id(&site), &site, &mut counts)
+        gather.irradiance(gather.id(&site), &site, &mut counts)
     }
 
     #[test]

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use cache_core::{Record, RecordId};
 use cache_proto::v1;
 
-use crate::frame::Levels;
+use crate::levels::Levels;
 use crate::task::Done;
 
 /// Finds a record that was gathered under the frame's draft before. The same id has the same bits, whoever made it.

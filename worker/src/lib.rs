@@ -7,11 +7,13 @@
 //! - [`bvh`]: rays against triangles.
 //! - [`world`]: what a ray meets, and from where the next may start.
 //! - [`bsdf`]: how light scatters at a surface.
+//! - [`lobes`]: which records serve a surface, and its gloss as they see it.
 //! - [`lights`]: where light comes from and how shadow rays find it.
 //! - [`spherical`]: lamps as seen from a point close by.
 //! - [`sampler`]: where a path's random numbers come from.
+//! - [`levels`]: the sealed records of a frame, of all kinds.
 //! - [`trace`]: what a ray sees where it lands: the second door, and the path tracer.
-//! - [`gather`]: a record of irradiance is made.
+//! - [`gather`]: a record is made.
 //! - [`pixel`]: one pixel as its samples come in.
 //! - [`refine`]: where records make visible steps, and how far they should shrink for that.
 //! - [`frame`]: the two kinds of work a worker leases: filling rounds and making pixels.
@@ -40,8 +42,10 @@ pub mod world;
 
 pub mod bsdf;
 pub mod lights;
+pub mod lobes;
 pub mod spherical;
 
+pub mod levels;
 pub mod sampler;
 pub mod trace;
 

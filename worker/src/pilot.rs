@@ -7,10 +7,12 @@
 
 use cache_core::hemisphere::Strata;
 use cache_core::id::Random;
+use cache_core::incoming::Bands;
 use cache_core::rounds::{RANKS, rank};
 
-use crate::frame::{Counts, Frame, Levels, Sums};
+use crate::frame::{Counts, Frame, Sums};
 use crate::gather::{Gather, Rays};
+use crate::levels::{Level, Levels};
 use crate::pixel::{Pixel, SPREAD};
 use crate::settings::{Effort, Settings};
 use crate::solo::{self, Order};
@@ -207,24 +209,27 @@ fn probe(frame: &Frame, levels: &Levels, counts: &mut Counts) -> f64 {
     let settings = frame.settings();
     let mut random = Random::named("probe", &[settings.seed]);
     let mut place = |size: u32| ((random.uniform() * size as f32) as u32).min(size - 1);
-    let strata = Strata::new(2 * settings.rays);
+    let (strata, bands) = (Strata::new(2 * settings.rays), Bands::new(2 * settings.rays));
     let gather = Gather {
         tracer: &frame.tracer(levels),
         namespace: frame.namespace(),
         seed: settings.seed,
         level: 1,
-        rays: Rays::Fixed(&strata),
+        strata: Rays::Fixed(&strata),
+        bands: Rays::Fixed(&bands),
         details: &settings.details,
     };
     let (mut sum, mut found) = (0.0, 0);
     for _ in 0..PROBES {
         // Another point of the pixel than the one records are made for.
-        let Some(site) = frame.site(1, 1, place(settings.width), place(settings.height), counts) else { continue };
-        let Some(answer) = levels[0].ask(&site.query()) else { continue };
-        let truth = gather.record(gather.id(&site), &site, counts);
-        let square = (truth.irradiance - answer.irradiance).length_squared() / 3.0;
-        let explained = truth.noise * truth.noise + answer.noise * answer.noise;
-        sum += f64::from((square - explained) * (site.reflectance * std::f32::consts::FRAC_1_PI).powi(2));
+        let candidate = frame.site(1, 1, place(settings.width), place(settings.height), counts);
+        let Some((site, served)) = candidate else { continue };
+        let Some(answer) = levels[0].ask(&site.query(), &served) else { continue };
+        let mut alone = Level::new(settings.a, settings.details);
+        alone.unite([&gather.record(gather.id(&site), &site, counts)]);
+        let Some(truth) = alone.ask(&site.query(), &served) else { continue };
+        let square = (truth.radiance - answer.radiance).length_squared() / 3.0;
+        sum += f64::from(square - truth.noise * truth.noise - answer.noise * answer.noise);
         found += 1;
     }
     (sum / f64::from(found.max(1))).max(0.0)

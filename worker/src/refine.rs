@@ -3,16 +3,15 @@
 //! Every shading point is tested against the cache as sealed before the round. What is proposed for a record in one tile
 //! is one proposal, the least: tiles are the same whoever does them.
 
+use cache_core::shrink::exclude;
+use cache_core::{RecordId, Shrink};
 use std::collections::BTreeMap;
-use std::f32::consts::FRAC_1_PI;
-
-use cache_core::sealed::Contribution;
-use cache_core::shrink::{Share, exclude};
-use cache_core::{Irradiance, RecordId, Sealed, Shrink};
 
 use crate::frame::Counts;
 use crate::gather::Site;
-use crate::scene::Rgb;
+use crate::levels::Level;
+use crate::lobes::Served;
+use crate::math::luminance;
 use crate::trace::Tracer;
 
 /// What a tile proposes: for each record the least a_i.
@@ -21,22 +20,13 @@ pub struct Proposals(BTreeMap<RecordId, f32>);
 
 impl Proposals {
     /// Tests a shading point; false where no record covers it.
-    pub fn test(&mut self, tracer: &Tracer<'_>, site: &Site, sealed: &Sealed<Irradiance>, counts: &mut Counts) -> bool {
-        let near = sealed.contributions(&site.query());
-        if near.len() < 2 {
-            return !near.is_empty();
+    pub fn test(&mut self, tracer: &Tracer, site: &Site, own: &Level, served: &Served, counts: &mut Counts) -> bool {
+        let shares = own.shares(&site.query(), served);
+        if shares.len() < 2 {
+            return !shares.is_empty();
         }
         let Some(bsdf) = tracer.world.bsdf(&site.at) else { return true };
-        let reflected = bsdf.diffuse() * FRAC_1_PI;
-        let share = |c: &Contribution<Irradiance>| Share {
-            id: c.record.id,
-            weight: c.weight,
-            luminance: luminance(reflected * c.answer.irradiance),
-            noise: luminance(reflected) * c.record.noise,
-            error: c.error,
-            a_min: c.a_min,
-        };
-        exclude(near.iter().map(share), || luminance(tracer.direct(site, &bsdf, counts)), |shrink| self.add(shrink));
+        exclude(shares, || luminance(tracer.direct(site, &bsdf, counts)), |shrink| self.add(shrink));
         true
     }
 
@@ -55,9 +45,4 @@ impl Proposals {
     pub fn take(self) -> impl Iterator<Item = Shrink> {
         self.0.into_iter().map(|(of, a)| Shrink::new(of, a))
     }
-}
-
-/// Luminance of linear RGB with the primaries of Rec. 709.
-fn luminance(light: Rgb) -> f32 {
-    light.dot(Rgb::new(0.2126, 0.7152, 0.0722))
 }

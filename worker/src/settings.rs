@@ -13,17 +13,23 @@ pub enum Method {
     Path,
     /// Irradiance caching on diffuse reflection; glossy reflection is sampled per pixel.
     Irradiance,
+    /// Radiance caching on all glossy reflection but mirrors, irradiance caching on the rest.
+    Radiance,
+    /// Radiance caching where it is as good as sampling, else as [`Self::Irradiance`].
+    Auto,
 }
 
 impl Method {
     /// Every method, in the order to show them.
-    pub const ALL: [Method; 2] = [Method::Path, Method::Irradiance];
+    pub const ALL: [Method; 4] = [Method::Path, Method::Irradiance, Method::Radiance, Method::Auto];
 
     /// Its name on the command line and on the wire.
     pub fn name(self) -> &'static str {
         match self {
             Method::Path => "path",
             Method::Irradiance => "irradiance",
+            Method::Radiance => "radiance",
+            Method::Auto => "auto",
         }
     }
 

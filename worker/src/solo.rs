@@ -1,13 +1,13 @@
 //! A frame without a farm: filled and finished in this process, for tests, charts and comparisons.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
+use cache_core::Record;
 use cache_core::rounds::{Plan, RANKS, Step};
-use cache_core::{Record, Sealed};
 use rayon::prelude::*;
 
-use crate::frame::{CHANNELS, Counts, Frame, Levels};
+use crate::frame::{CHANNELS, Counts, Frame};
+use crate::levels::{Level, Levels};
 use crate::task::CpuClock;
 
 /// In which order candidates are tested.
@@ -42,7 +42,7 @@ pub fn fill(frame: &Frame, order: Order) -> Levels {
 /// Fills every level of a frame as far as pixels of ranks below `end` want it; fewer than all in one pass.
 pub fn fill_ranks(frame: &Frame, order: Order, end: u32) -> Filled {
     let (a, details) = (frame.settings().a, frame.settings().details);
-    let mut levels: Levels = (0..frame.levels()).map(|_| Arc::new(Sealed::with(a, details))).collect();
+    let mut levels: Levels = (0..frame.levels()).map(|_| Level::new(a, details)).collect();
     let (mut counts, mut proposals, mut sealing_seconds) = (Counts::default(), 0, 0.0);
     let mut plan = Plan::new(frame.levels(), details.adaptive, frame.settings().size());
     let mut gathered = 0;
@@ -71,7 +71,7 @@ pub fn fill_ranks(frame: &Frame, order: Order, end: u32) -> Filled {
                 }
                 proposals += new.values().filter(|record| matches!(record, Record::Shrink(_))).count() as u64;
                 let clock = CpuClock::start();
-                Arc::make_mut(&mut levels[level as usize - 1]).unite(new.values());
+                levels[level as usize - 1].unite(new.values());
                 sealing_seconds += clock.seconds();
             }
         }

@@ -194,17 +194,17 @@ mod tests {
         let frame = Frame::new(scene, Settings { rays: 64, ..Settings::new(camera, 16, 16) });
         let step = v1::Step { index: 5, level: 1, rank_to: 4096, ..Default::default() };
         let lease = |known: BTreeMap<RecordId, Record>| {
-            let known = Arc::new(move |id| known.get(&id).copied());
+            let known = Arc::new(move |id| known.get(&id).cloned());
             let (levels, dropped) = (Vec::new(), Arc::new(|| false));
             run(&frame, &Work { step: step.clone(), tiles: 0..1, levels, known, dropped }).expect("not dropped")
         };
         let first = lease(BTreeMap::new());
         assert!(first.records.len() > 100 && first.counts.reused == 0);
         assert!(first.records.iter().all(|(tag, _)| *tag == Tag { level: 1, step: 5 }));
-        let again = lease(first.records.iter().map(|(_, r)| (r.id(), *r)).collect());
+        let again = lease(first.records.iter().map(|(_, r)| (r.id(), r.clone())).collect());
         assert_eq!((&again.records, again.counts.reused), (&first.records, first.records.len() as u64));
         assert!(again.counts.path_rays * 10 < first.counts.path_rays);
-        let half = lease(first.records.iter().step_by(2).map(|(_, r)| (r.id(), *r)).collect());
+        let half = lease(first.records.iter().step_by(2).map(|(_, r)| (r.id(), r.clone())).collect());
         assert_eq!((half.records, half.counts.reused), (first.records, again.counts.reused.div_ceil(2)));
     }
 }

@@ -8,15 +8,16 @@
 
 use std::f32::consts::FRAC_1_PI;
 
-use cache_core::hemisphere::{Sample, Strata, irradiance};
+use cache_core::hemisphere::{Cells, Sample, Strata, irradiance};
 use cache_core::id::Random;
-use cache_core::irradiance::Answer;
 use glam::{Vec2, Vec3};
 
 use crate::bsdf::{Bsdf, Part};
-use crate::frame::{Counts, Levels};
+use crate::frame::Counts;
 use crate::gather::Site;
+use crate::levels::{Levels, Reflected};
 use crate::lights::{Lights, Place};
+use crate::lobes::{Lobes, Served};
 use crate::math::Frame;
 use crate::sampler::Sampler;
 use crate::scene::Rgb;
@@ -37,6 +38,8 @@ pub struct Tracer<'a> {
     pub world: &'a World,
     /// What there is to look for.
     pub lights: &'a Lights,
+    /// Which surfaces records of radiance serve.
+    pub lobes: &'a Lobes,
     /// The sealed records; empty for the path tracer.
     pub levels: &'a Levels,
     /// Indirect bounces to follow.
@@ -62,6 +65,8 @@ pub enum Chance {
         density: f32,
         /// Where lamps were looked for: their chances there count, not those where the ray starts, just off the surface.
         from: Place,
+        /// Whether the ray is for sampled light alone: records have told all the rest.
+        alone: bool,
     },
 }
 
@@ -108,6 +113,9 @@ impl Tracer<'_> {
             if depth == first {
                 seen.emission = emitted;
             }
+            if matches!(chance, Chance::Weighed { alone: true, .. }) {
+                break;
+            }
             let Some(at) = meeting else { break };
             if depth == first {
                 seen.distance = at.distance;
@@ -118,12 +126,15 @@ impl Tracer<'_> {
             let Some(bsdf) = self.world.bsdf(&at) else { break };
             let outgoing = at.frame.to_local(-direction);
             let four = sampler.next4();
-            let part = match self.answer(&at, &bsdf, depth, sampler, counts) {
+            let served = self.served(&at, &bsdf, outgoing, depth);
+            let answer = served.as_ref().and_then(|served| self.answer(&at, served, depth, sampler, counts));
+            let alone = answer.is_some() && matches!(served, Some(Served::Gloss(..)));
+            let part = match answer {
                 Some(answer) => {
-                    seen.indirect += throughput * bsdf.diffuse() * answer.irradiance * FRAC_1_PI;
+                    seen.indirect += throughput * answer.radiance;
                     if depth == first {
                         (seen.irradiance, seen.records) = (answer.irradiance, answer.records);
-                        seen.noise = answer.noise * bsdf.diffuse().length() * (FRAC_1_PI / 3f32.sqrt());
+                        seen.noise = answer.noise;
                     }
                     Part::Gloss
                 }
@@ -153,7 +164,7 @@ impl Tracer<'_> {
                 throughput /= survival;
             }
             chance = match scatter.pdf {
-                density if density.is_finite() => Chance::Weighed { density, from: at.place() },
+                density if density.is_finite() => Chance::Weighed { density, from: at.place(), alone },
                 _ => Chance::All,
             };
             (origin, direction) = (at.leave(incoming), incoming);
@@ -162,38 +173,42 @@ impl Tracer<'_> {
         seen
     }
 
-    /// Irradiance at a surface as far as records, or a small gather in their place, can tell it; `None`: follow the path.
+    /// Which records serve a surface met at a depth; `None`: those of none.
+    pub fn served(&self, at: &Meeting, bsdf: &Bsdf, outgoing: Vec3, depth: u32) -> Option<Served<'_>> {
+        if !self.cached || !self.world.cached(at) {
+            return None;
+        }
+        self.lobes.serve(self.world.material(at), bsdf, outgoing, depth)
+    }
+
+    /// Light a surface reflects as far as records, or a small gather in their place, can tell it; `None`: follow the path.
     fn answer(
         &self,
         at: &Meeting,
-        bsdf: &Bsdf,
+        served: &Served,
         depth: u32,
         sampler: &mut Sampler,
         counts: &mut Counts,
-    ) -> Option<Answer> {
-        if bsdf.diffuse() == Rgb::ZERO {
-            return None;
-        }
-        if !self.world.cached(at) {
-            return None;
-        }
+    ) -> Option<Reflected> {
         let Some(level) = self.levels.get(depth as usize - 1) else {
             // The last bounce reflects lamps, which shadow rays find, and gathered light: without any, nothing is left.
-            let nothing_left = self.cached && depth - 1 == self.bounces && !self.lights.any_gathered();
-            return nothing_left.then(Answer::default);
+            let nothing_left = depth - 1 == self.bounces && !self.lights.any_gathered();
+            return nothing_left.then(Reflected::default);
         };
         counts.queries += 1;
-        let answer = level.ask(&at.query());
+        let answer = level.ask(&at.query(), served);
         if answer.is_some() {
             return answer;
         }
         counts.misses += 1;
+        let Served::Diffuse(albedo) = served else { return None };
         counts.regathers += u64::from(self.regather.is_some());
         self.regather.map(|strata| {
             // Only what the camera sees is worth a gather of its own: its rays follow paths.
             let tracer = Tracer { regather: None, ..*self };
             let samples = tracer.hemisphere(at, at.frame, depth, strata, &mut sampler.branch(), counts);
-            Answer { irradiance: irradiance(&samples), ..Answer::default() }
+            let irradiance = irradiance(&samples);
+            Reflected { radiance: *albedo * irradiance * FRAC_1_PI, irradiance, ..Reflected::default() }
         })
     }
 
@@ -203,13 +218,13 @@ impl Tracer<'_> {
         at: &Meeting,
         frame: Frame,
         depth: u32,
-        strata: &Strata,
+        cells: &impl Cells,
         sampler: &mut Sampler,
         counts: &mut Counts,
     ) -> Vec<Sample> {
         let mut ray = |cell| {
             let [u, v, ..] = sampler.next4();
-            let local = strata.direction(cell, Vec2::new(u, v));
+            let local = cells.direction(cell, Vec2::new(u, v));
             let direction = frame.to_world(local).normalize();
             if direction.dot(at.facet) <= 0.0 {
                 // Below the facet of a smooth surface: the surface hides itself, at no distance worth counting.
@@ -219,7 +234,7 @@ impl Tracer<'_> {
             // Nothing is so near that its inverse overflows.
             Sample { direction: local, radiance: seen.total(), distance: seen.distance.max(1e-30) }
         };
-        (0..strata.rays()).map(&mut ray).collect()
+        (0..cells.rays()).map(&mut ray).collect()
     }
 
     /// Light without bounce that leaves a site for the camera, W/(sr m²).
@@ -275,7 +290,8 @@ impl Tracer<'_> {
                     emission
                 }
             }
-            Chance::Weighed { density, from } => {
+            Chance::Weighed { alone: true, .. } if !sampled => Rgb::ZERO,
+            Chance::Weighed { density, from, .. } => {
                 let looked = self.lights.pdf_triangle(self.world, at.triangle, &from, direction, at.distance);
                 emission * heuristic(density, looked)
             }
@@ -286,10 +302,10 @@ impl Tracer<'_> {
         self.lights
             .beyond(self.world, direction)
             .map(|(radiance, light)| match (chance, light) {
-                (Chance::Weighed { density, from }, Some(light)) => {
+                (Chance::Weighed { density, from, .. }, Some(light)) => {
                     radiance * heuristic(density, self.lights.pdf_distant(&from, light))
                 }
-                (Chance::Gathered, Some(_)) => Rgb::ZERO,
+                (Chance::Gathered, Some(_)) | (Chance::Weighed { alone: true, .. }, None) => Rgb::ZERO,
                 _ => radiance,
             })
             .sum()

@@ -106,9 +106,14 @@ impl World {
         tilted.try_normalize()
     }
 
+    /// Which material it is made of.
+    pub fn material(&self, at: &Meeting) -> u32 {
+        self.scene.triangles[at.triangle as usize].material
+    }
+
     /// Whether records may answer for what is reflected there.
     pub fn cached(&self, at: &Meeting) -> bool {
-        self.scene.materials[self.scene.triangles[at.triangle as usize].material as usize].cached
+        self.scene.materials[self.material(at) as usize].cached
     }
 
     /// Whether something lies between two points that are already off their surfaces.
@@ -142,8 +147,7 @@ impl World {
 
     /// Radiance the surface emits towards the ray, W/(sr m²).
     pub fn emission(&self, at: &Meeting) -> Rgb {
-        let triangle = &self.scene.triangles[at.triangle as usize];
-        if at.front { self.scene.materials[triangle.material as usize].emission } else { Rgb::ZERO }
+        if at.front { self.scene.materials[self.material(at) as usize].emission } else { Rgb::ZERO }
     }
 
     /// A point on a triangle, moved just off its front.

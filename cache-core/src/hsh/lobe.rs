@@ -27,8 +27,10 @@ pub struct Lobe {
 struct Row {
     /// ∫ f H dω_i, 1/√sr.
     coefficients: [f32; COEFFICIENTS_MAX],
-    /// Share of ∫ f² dω_i that each order from 1 captures (Gautron 2004 eq. 15); 1 for a lobe that is 0 there.
-    captured: [f32; ORDER_MAX],
+    /// ∫ f² dω_i, 1/sr.
+    energy: f32,
+    /// Of that, what each order from 1 misses (Gautron 2004 eq. 15), 1/sr.
+    missed: [f32; ORDER_MAX],
 }
 
 impl Lobe {
@@ -82,22 +84,25 @@ impl Lobe {
         coefficients
     }
 
-    /// Least order that misses at most the fraction `error` of its energy where the outgoing direction has cosine `cosine`;
-    /// `None` if no order up to the greatest does.
-    pub fn order(&self, cosine: f32, error: f32) -> Option<usize> {
-        let (row, _) = place(cosine);
-        (1..=ORDER_MAX).find(|order| self.rows[row..row + 2].iter().all(|r| 1.0 - r.captured[order - 1] <= error))
+    /// ∫ f² dω_i where the outgoing direction has this cosine, and what of it an order misses, 1/sr; both interpolated.
+    #[inline]
+    pub fn energy(&self, cosine: f32, order: usize) -> (f32, f32) {
+        let (row, share) = place(cosine);
+        let [here, next] = [&self.rows[row], &self.rows[row + 1]];
+        let between = |a: f32, b: f32| a + (b - a) * share;
+        (between(here.energy, next.energy), between(here.missed[order - 1], next.missed[order - 1]))
     }
 }
 
 impl Row {
     fn new(mut sums: [f64; COEFFICIENTS_MAX], energy: f64) -> Self {
         (0..ORDER_MAX).for_each(|l| sums[l * l..l * l + l].fill(0.0));
-        let share = |i: usize| {
+        let missed = |i: usize| {
             let captured: f64 = sums[..(i + 1) * (i + 1)].iter().map(|c| c * c).sum();
-            if energy > 0.0 { (captured / energy) as f32 } else { 1.0 }
+            (energy - captured).max(0.0) as f32
         };
-        Self { captured: std::array::from_fn(share), coefficients: sums.map(|sum| sum as f32) }
+        let missed = std::array::from_fn(missed);
+        Self { energy: energy as f32, missed, coefficients: sums.map(|sum| sum as f32) }
     }
 }
 
@@ -168,10 +173,18 @@ mod tests {
         let lobe = Lobe::new(phong(10));
         for out in [outgoing(0.2, 1.0), outgoing(1.0, -2.1)] {
             let exact: f64 = hemisphere(100).map(|(d, w)| w * light(d) * f64::from(phong(10)(out, d.as_vec3()))).sum();
-            let reflected = crate::radiance::reflected(&lobe.coefficients(out), &incoming);
+            let reflected = crate::radiance::reflected(&[lobe.coefficients(out); 3], &incoming);
             assert!((f64::from(reflected.y) / exact - 1.0).abs() < 0.005, "{out}: {reflected} {exact}");
             assert_eq!((reflected.x, reflected.z), (0.0, 0.0));
         }
+    }
+
+    /// Least order that misses at most the fraction `error` of the energy, if one does.
+    fn least(lobe: &Lobe, cosine: f32, error: f32) -> Option<usize> {
+        (1..=ORDER_MAX).find(|order| {
+            let (energy, missed) = lobe.energy(cosine, *order);
+            missed <= error * energy
+        })
     }
 
     #[test]
@@ -179,7 +192,7 @@ mod tests {
         let needed = |error: f32| {
             [1, 2, 5, 10, 22, 50, 100, 400].map(|exponent| {
                 let lobe = Lobe::new(phong(exponent));
-                [0.0f32, 45.0, 75.0].map(|angle| lobe.order(angle.to_radians().cos(), error))
+                [0.0f32, 45.0, 75.0].map(|angle| least(&lobe, angle.to_radians().cos(), error))
             })
         };
         let five = needed(0.05);
@@ -201,9 +214,9 @@ mod tests {
     fn a_diffuse_lobe_has_two_bands() {
         let lobe = Lobe::new(|_, incoming| incoming.z / PI as f32);
         for cosine in [1.0, 0.5, 0.0] {
-            assert_eq!(lobe.order(cosine, 1e-6), Some(2));
+            assert_eq!(least(&lobe, cosine, 1e-6), Some(2));
         }
         let dark = Lobe::new(|_, _| 0.0);
-        assert_eq!(dark.order(0.5, 0.0), Some(1));
+        assert_eq!(least(&dark, 0.5, 0.0), Some(1));
     }
 }

@@ -159,7 +159,10 @@ impl Archive {
         match checked {
             Checked::Batch(namespace, tag, records) => {
                 let set = self.replica.set(&namespace);
-                let here = |record: &Record| set.and_then(|set| set.get(record.id())).is_some_and(|(held, known)| (*held, known) == (tag, record));
+                let here = |record: &Record| {
+                    set.and_then(|set| set.get(record.id()))
+                        .is_some_and(|(held, known)| (*held, known) == (tag, record))
+                };
                 let new: Vec<_> = records.into_iter().filter(|record| !here(record)).collect();
                 let batch = (!new.is_empty()).then(|| convert::pack(&namespace, tag, &new));
                 batch.map(|batch| v1::Entry { entry: Some(Kind::Batch(batch)) })

@@ -1,0 +1,244 @@
+//! The sealed records of a frame: of each level those of irradiance, and of the first those of radiance by their order.
+
+use std::collections::BTreeMap;
+use std::f32::consts::FRAC_1_PI;
+use std::sync::Arc;
+
+use cache_core::details::Details;
+use cache_core::id::Digest;
+use cache_core::radiance::{self, Coefficients};
+use cache_core::sealed::Contribution;
+use cache_core::shrink::Share;
+use cache_core::{Irradiance, Query, Radiance, Record, Sealed};
+use smallvec::SmallVec;
+
+use crate::lobes::{Reflection, Served};
+use crate::math::luminance;
+use crate::scene::Rgb;
+
+/// Every level; `[0]` is level 1. Cheap to clone.
+pub type Levels = Vec<Level>;
+
+/// One level.
+#[derive(Clone)]
+pub struct Level {
+    a: f32,
+    details: Details,
+    /// Diffuse light.
+    pub irradiance: Arc<Sealed<Irradiance>>,
+    /// Light for glossy surfaces, by the order of the records.
+    radiance: BTreeMap<usize, Arc<dyn Glossy>>,
+    /// Proposals that records shrink, for those of orders not seen yet.
+    shrinks: Vec<Record>,
+}
+
+/// What records say a surface reflects.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Reflected {
+    /// Outgoing radiance, W/(sr m²).
+    pub radiance: Rgb,
+    /// Irradiance, W/m².
+    pub irradiance: Rgb,
+    /// How many records answered.
+    pub records: u32,
+    /// Standard error of the radiance for the records' noise, root mean square over the channels, W/(sr m²).
+    pub noise: f32,
+}
+
+impl Level {
+    /// An empty one whose records will count with the allowed error `a`.
+    pub fn new(a: f32, details: Details) -> Self {
+        let irradiance = Arc::new(Sealed::with(a, details));
+        Self { a, details, irradiance, radiance: BTreeMap::new(), shrinks: Vec::new() }
+    }
+
+    /// Adds records of all kinds, and proposals that records shrink.
+    pub fn unite<'r>(&mut self, new: impl IntoIterator<Item = &'r Record>) {
+        let new: Vec<_> = new.into_iter().collect();
+        if new.is_empty() {
+            return;
+        }
+        let mut orders: Vec<_> = new
+            .iter()
+            .filter_map(|record| if let Record::Radiance(r) = record { Some(r.order()) } else { None })
+            .collect();
+        orders.sort_unstable();
+        orders.dedup();
+        for order in orders {
+            let Some(mut set) = empty(order, self.a, self.details).filter(|_| !self.radiance.contains_key(&order))
+            else {
+                continue;
+            };
+            if let Some(set) = Arc::get_mut(&mut set) {
+                set.unite(&self.shrinks.iter().collect::<Vec<_>>());
+            }
+            self.radiance.insert(order, set);
+        }
+        Arc::make_mut(&mut self.irradiance).unite(new.iter().copied());
+        for set in self.radiance.values_mut() {
+            if Arc::get_mut(set).is_none() {
+                *set = set.copied();
+            }
+            if let Some(set) = Arc::get_mut(set) {
+                set.unite(&new);
+            }
+        }
+        self.shrinks.extend(new.into_iter().filter(|record| matches!(record, Record::Shrink(_))).cloned());
+    }
+
+    /// What a surface reflects by the records that serve it; `None` where none covers the query.
+    #[inline]
+    pub fn ask(&self, query: &Query, served: &Served) -> Option<Reflected> {
+        match served {
+            Served::Diffuse(albedo) => self.irradiance.ask(query).map(|answer| Reflected {
+                radiance: *albedo * answer.irradiance * FRAC_1_PI,
+                irradiance: answer.irradiance,
+                records: answer.records,
+                noise: answer.noise * albedo.length() * (FRAC_1_PI / 3f32.sqrt()),
+            }),
+            Served::Gloss(order, reflection) => self.radiance.get(order)?.ask(query, reflection),
+        }
+    }
+
+    /// Whether any of these records counts at a query.
+    pub fn covers(&self, query: &Query, served: &Served) -> bool {
+        match served {
+            Served::Diffuse(_) => self.irradiance.covers(query),
+            Served::Gloss(order, _) => self.radiance.get(order).is_some_and(|set| set.covers(query)),
+        }
+    }
+
+    /// What each record that counts at a query brings to what is reflected there.
+    pub fn shares(&self, query: &Query, served: &Served) -> SmallVec<[Share; 8]> {
+        match served {
+            Served::Diffuse(albedo) => {
+                let reflected = *albedo * FRAC_1_PI;
+                let share = |c: &Contribution<Irradiance>| Share {
+                    id: c.record.id,
+                    weight: c.weight,
+                    luminance: luminance(reflected * c.answer.irradiance),
+                    noise: luminance(reflected) * c.record.noise,
+                    error: c.error,
+                    a_min: c.a_min,
+                };
+                self.irradiance.contributions(query).iter().map(share).collect()
+            }
+            Served::Gloss(order, reflection) => {
+                self.radiance.get(order).map_or_else(SmallVec::new, |set| set.shares(query, reflection))
+            }
+        }
+    }
+
+    /// The allowed error a record made at a query should begin with.
+    pub fn first_a(&self, query: &Query, served: &Served) -> f32 {
+        match served {
+            Served::Diffuse(_) => self.irradiance.first_a(query),
+            Served::Gloss(order, _) => self.radiance.get(order).map_or(self.a, |set| set.first_a(query)),
+        }
+    }
+
+    /// Records of all kinds.
+    pub fn len(&self) -> usize {
+        self.irradiance.len() + self.radiance.values().map(|set| set.len()).sum::<usize>()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Bytes the records take in memory, all that is derived from them included.
+    pub fn bytes(&self) -> usize {
+        self.irradiance.bytes() + self.radiance.values().map(|set| set.bytes()).sum::<usize>()
+    }
+
+    /// Digest of what gathers of the level above read.
+    pub fn digest(&self) -> Digest {
+        self.irradiance.digest()
+    }
+}
+
+/// Sealed records of radiance, of whatever order.
+pub trait Glossy: Send + Sync {
+    /// Adds records of its order, and proposals that records shrink.
+    fn unite(&mut self, new: &[&Record]);
+    /// The same set again.
+    fn copied(&self) -> Arc<dyn Glossy>;
+    /// How many records.
+    fn len(&self) -> usize;
+    /// Bytes they take.
+    fn bytes(&self) -> usize;
+    /// Whether any record counts at a query.
+    fn covers(&self, query: &Query) -> bool;
+    /// The allowed error a record made at a query should begin with.
+    fn first_a(&self, query: &Query) -> f32;
+    /// What is reflected at a query.
+    fn ask(&self, query: &Query, reflection: &Reflection) -> Option<Reflected>;
+    /// What each record that counts at a query brings to that.
+    fn shares(&self, query: &Query, reflection: &Reflection) -> SmallVec<[Share; 8]>;
+}
+
+impl<const N: usize> Glossy for Sealed<Radiance<N>> {
+    fn unite(&mut self, new: &[&Record]) {
+        self.unite(new.iter().copied());
+    }
+
+    fn copied(&self) -> Arc<dyn Glossy> {
+        Arc::new(self.clone())
+    }
+
+    fn len(&self) -> usize {
+        self.len()
+    }
+
+    fn bytes(&self) -> usize {
+        self.bytes()
+    }
+
+    fn covers(&self, query: &Query) -> bool {
+        self.covers(query)
+    }
+
+    fn first_a(&self, query: &Query) -> f32 {
+        self.first_a(query)
+    }
+
+    fn ask(&self, query: &Query, reflection: &Reflection) -> Option<Reflected> {
+        self.ask(query).map(|answer| reflected(&answer, &reflection.coefficients()))
+    }
+
+    fn shares(&self, query: &Query, reflection: &Reflection) -> SmallVec<[Share; 8]> {
+        let lobe = reflection.coefficients::<N>();
+        let gain = radiance::gain(&lobe);
+        let share = |c: &Contribution<Radiance<N>>| Share {
+            id: c.record.id,
+            weight: c.weight,
+            luminance: luminance(radiance::reflected(&lobe, &c.answer.coefficients)),
+            noise: gain * c.record.noise,
+            error: c.error,
+            a_min: c.a_min,
+        };
+        self.contributions(query).iter().map(share).collect()
+    }
+}
+
+fn empty(order: usize, a: f32, details: Details) -> Option<Arc<dyn Glossy>> {
+    Some(match order {
+        2 => Arc::new(Sealed::<Radiance<4>>::with(a, details)),
+        4 => Arc::new(Sealed::<Radiance<16>>::with(a, details)),
+        6 => Arc::new(Sealed::<Radiance<36>>::with(a, details)),
+        8 => Arc::new(Sealed::<Radiance<64>>::with(a, details)),
+        10 => Arc::new(Sealed::<Radiance<100>>::with(a, details)),
+        _ => return None,
+    })
+}
+
+fn reflected<const N: usize>(answer: &radiance::Answer<N>, lobe: &Coefficients<N>) -> Reflected {
+    Reflected {
+        // A sum that rings may be negative.
+        radiance: radiance::reflected(lobe, &answer.coefficients).max(Rgb::ZERO),
+        irradiance: radiance::irradiance(&answer.coefficients).max(Rgb::ZERO),
+        records: answer.records,
+        noise: radiance::gain(lobe) * answer.noise,
+    }
+}
