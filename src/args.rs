@@ -261,10 +261,7 @@ mod tests {
         let settings = args(&[]).settings(&scene()).expect("sound");
         let expected = (libm::tanf(0.5) / libm::tanf(0.25) * 512.0).round() as u32;
         assert_eq!((settings.width, settings.height, settings.spp), (expected, defaults::HEIGHT, defaults::SPP));
-        assert_eq!(
-            (settings.method, settings.rays, settings.bounces),
-            (Method::Auto, defaults::RAYS, ALL_BOUNCES)
-        );
+        assert_eq!((settings.method, settings.rays, settings.bounces), (Method::Auto, defaults::RAYS, ALL_BOUNCES));
         assert_eq!(settings.camera.name, "front");
     }
 

@@ -10,6 +10,8 @@
 //! - [`details`]: what each practical detail of irradiance caching buys.
 //! - [`peers`]: what others use, on the same scenes.
 //! - [`results`]: what pictures cost and how good they are, over several runs.
+//! - [`rounded`]: a ball and a torus that gloss.
+//! - [`gloss`]: records of radiance against sampling.
 //! - [`lamps`]: a thousand lamps against one.
 //! - [`start`]: from the start of the program to the first ray, and memory.
 //! - [`soups`]: rooms of many triangles, and rays in them.
@@ -35,6 +37,9 @@ pub mod own;
 
 pub mod peers;
 pub mod results;
+
+pub mod gloss;
+pub mod rounded;
 
 pub mod lamps;
 pub mod lookups;

@@ -3,7 +3,7 @@
 use std::error::Error;
 
 use ambience_bench::host::HostArgs;
-use ambience_bench::{asked, details, farm, host, lamps, lookups, peers, pictures, rays, service, start};
+use ambience_bench::{asked, details, farm, gloss, host, lamps, lookups, peers, pictures, rays, service, start};
 use clap::{Parser, Subcommand};
 
 /// Speed against accuracy: every method at several settings, on the scenes with references.
@@ -23,6 +23,8 @@ enum Command {
     Details(details::DetailsArgs),
     /// Whether `--error` gives the error asked for, and what it costs
     Asked(asked::AskedArgs),
+    /// Records of radiance against sampling, by the sharpness of gloss
+    Gloss(gloss::GlossArgs),
     /// Rays a second, against Embree
     Rays(rays::RaysArgs),
     /// Look-ups a second, against an octree of pointers
@@ -48,6 +50,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         None => pictures::run(pictures),
         Some(Command::Details(args)) => details::run(&args),
         Some(Command::Asked(args)) => asked::run(&args),
+        Some(Command::Gloss(args)) => gloss::run(&args),
         Some(Command::Rays(args)) => rays::run(&args),
         Some(Command::Lookups(args)) => lookups::run(&args),
         Some(Command::Lamps(args)) => lamps::run(&args),

@@ -56,8 +56,13 @@ fn traced(scene: &Scene, settings: Settings, spp: u32, seed: u64) -> Vec<[f64; 3
     rgb(&solo::pixels(&frame, &Vec::new()).0)
 }
 
-fn reference(name: &str, scene: &Scene, camera: &Camera) -> Result<Reference, Box<dyn Error>> {
+/// A reference of a scene of that name, made once and kept under target/.
+///
+/// # Errors
+/// The disk's.
+pub fn reference(name: &str, scene: &Scene, camera: &Camera) -> Result<Reference, Box<dyn Error>> {
     let view = blake3::hash(format!("{camera:?}").as_bytes());
+    std::fs::create_dir_all(folder())?;
     let digest = hex::encode(&scene.hash[..4]) + &hex::encode(&view.as_bytes()[..4]);
     let path = folder().join(format!("{name}-{digest}-{}.exr", PICTURES * u64::from(SPP)));
     if path.exists() {

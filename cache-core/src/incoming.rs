@@ -9,11 +9,12 @@ use std::f32::consts::TAU;
 
 use glam::{Vec2, Vec3};
 
-use crate::details::{Details, Gradients};
+use crate::details::{Details, Gradients, Metric};
 use crate::hemisphere::{Cells, Estimated, Sample, distance, variance};
 use crate::hsh::rotation::turn;
 use crate::hsh::{ORDER_MAX, harmonics, order, polar};
 use crate::math::{Rgb, sin_cos};
+use crate::mesh::{absolute, survey, turned};
 use crate::radiance::{Coefficients, irradiance};
 
 /// What a whole gather says.
@@ -26,6 +27,8 @@ pub struct Estimate<const N: usize> {
     /// Harmonic mean of the distances, or the least of them, limited by |E| / |∇_t E| (Krivanek 2006 eq. 2); world length, may
     /// be infinite.
     pub radius: f32,
+    /// (xx, xy, yy) of M, 1/m²: at a distance d the second derivatives change E by (dᵀ M d) E. 0 where they were not asked for.
+    pub ellipse: [f32; 3],
     /// Standard error of each coefficient, root mean square over the channels, W/(√sr m²).
     pub noise: f32,
 }
@@ -34,6 +37,7 @@ impl<const N: usize> Estimate<N> {
     /// The same in a frame turned about the normal by an angle given as (cosine, sine).
     pub fn turned(mut self, angle: Vec2) -> Self {
         self.coefficients.iter_mut().chain(self.gradient.as_flattened_mut()).for_each(|c| turn(c, angle));
+        self.ellipse = turned(self.ellipse, angle);
         let [along_x, along_y] = &mut self.gradient;
         for (x, y) in along_x.as_flattened_mut().iter_mut().zip(along_y.as_flattened_mut()) {
             (*x, *y) = (*x * angle.x + *y * angle.y, *y * angle.x - *x * angle.y);
@@ -136,10 +140,18 @@ impl Bands {
         let slope = Vec2::new(along_x, along_y).length();
         let limited = details.radius_by_gradient && slope > 0.0;
         let by_gradient = if limited { irradiance(&coefficients).element_sum().abs() / slope } else { f32::INFINITY };
+        let mean = irradiance(&coefficients).element_sum() * (1.0 / 3.0);
+        let ellipse = match details.metric {
+            Metric::Hessian if mean > 0.0 => {
+                absolute(survey(samples, self.polar, self.sectors.len()).hessian).map(|h| h / (2.0 * mean))
+            }
+            _ => [0.0; 3],
+        };
         Estimate {
             coefficients,
             gradient,
             radius: distance(samples, details.distance).min(by_gradient),
+            ellipse,
             noise: (variance(samples, self.sectors.len()) * solid_angle).sqrt(),
         }
     }

@@ -76,15 +76,8 @@ impl Cached for Irradiance {
     /// The error e is that of Ward 1988 eq. 5, or the ellipse's where that says more.
     #[inline]
     fn error(&self, query: &Query, radius: f32, a: f32) -> f32 {
-        let Some((mut translation, rotation)) = site::error(self.position, self.normal, query, radius, a) else {
-            return f32::INFINITY;
-        };
-        let [xx, xy, yy] = self.ellipse;
-        if xx + yy > 0.0 {
-            let Vec2 { x, y } = Frame::around(self.normal).tangential(query.position - self.position);
-            translation = translation.max((x * x * xx + 2.0 * x * y * xy + y * y * yy).max(0.0).sqrt());
-        }
-        translation + rotation
+        let of = (self.position, self.normal, self.ellipse);
+        site::error(of, query, radius, a).map_or(f32::INFINITY, |(error, _)| error)
     }
 
     /// Ward 1992 eq. 6: E_i + (n_i × n)·∇_r E_i + (p - p_i)·∇_t E_i, never below 0; n is the shading normal, so that bumps
@@ -215,12 +208,7 @@ impl Irradiance {
             return Err(Invalid::NotFinite { field: unsound.map_or("a field", |(field, _)| field) });
         }
         site::check(self.position, self.normal, self.radius, self.radius_bounds())?;
-        let [xx, xy, yy] = self.ellipse.map(f64::from);
-        // A record reaches as far as R lets it at most, so an ellipse without end in some direction does no harm.
-        if xx < 0.0 || yy < 0.0 || xy * xy > xx * yy * (1.0 + 1e-5) {
-            let expected = "no negative axis";
-            return Err(Invalid::Range { field: "ellipse", value: self.ellipse[1], expected });
-        }
+        site::check_ellipse(self.ellipse)?;
         if self.noise < 0.0 {
             return Err(Invalid::Range { field: "noise", value: self.noise, expected: "0 or more" });
         }

@@ -167,6 +167,15 @@ pub fn absolute([xx, xy, yy]: [f32; 3]) -> [f32; 3] {
     [square[0] + root, square[1], square[2] + root].map(|v| (v / trace) as f32 * scale)
 }
 
+/// The matrix (xx, xy, yy) in a frame turned by an angle given as (cosine, sine).
+pub fn turned([xx, xy, yy]: [f32; 3], Vec2 { x: c, y: s }: Vec2) -> [f32; 3] {
+    [
+        xx * c * c + 2.0 * xy * s * c + yy * s * s,
+        (yy - xx) * s * c + xy * (c * c - s * s),
+        xx * s * s - 2.0 * xy * s * c + yy * c * c,
+    ]
+}
+
 #[cfg(test)]
 mod tests {
     use glam::DVec3;

@@ -58,6 +58,8 @@ pub struct Radiance<const N: usize> {
     pub radius_min: f32,
     /// Greatest R the record counts with, world length.
     pub radius_max: f32,
+    /// (xx, xy, yy) of M, 1/m², as of [`crate::Irradiance::ellipse`]: how far E could be known by its gradient.
+    pub ellipse: [f32; 3],
     /// Standard error of each coefficient, root mean square over the channels, W/(√sr m²): outgoing radiance errs by it times
     /// the length of the lobe's coefficients.
     pub noise: f32,
@@ -99,11 +101,11 @@ impl<const N: usize> Cached for Radiance<N> {
         (self.radius_min, self.radius_max)
     }
 
-    /// That of Ward 1988 eq. 5, for turns a rotation is known for.
+    /// That of Ward 1988 eq. 5 or the ellipse's, for turns a rotation is known for.
     #[inline]
     fn error(&self, query: &Query, radius: f32, a: f32) -> f32 {
-        match site::error(self.position, self.normal, query, radius, a) {
-            Some((translation, rotation)) if rotation <= TURN_MAX => translation + rotation,
+        match site::error((self.position, self.normal, self.ellipse), query, radius, a) {
+            Some((error, rotation)) if rotation <= TURN_MAX => error,
             _ => f32::INFINITY,
         }
     }
@@ -170,7 +172,8 @@ impl<const N: usize> Packed for Radiance<N> {
             radius: f[6],
             radius_min: f[7],
             radius_max: f[8],
-            noise: f[9],
+            ellipse: [f[9], f[10], f[11]],
+            noise: f[12],
             coefficients: coefficients(),
             gradient: [coefficients(), coefficients()],
         };
@@ -191,6 +194,8 @@ pub struct Plain {
     pub radius: f32,
     /// Least and greatest R it counts with.
     pub radius_bounds: (f32, f32),
+    /// M.
+    pub ellipse: [f32; 3],
     /// Standard error of each coefficient.
     pub noise: f32,
     /// Λ of each channel.
@@ -208,6 +213,7 @@ impl<const N: usize> From<&Radiance<N>> for Plain {
             normal: r.normal,
             radius: r.radius,
             radius_bounds: r.radius_bounds(),
+            ellipse: r.ellipse,
             noise: r.noise,
             coefficients: channels(&r.coefficients),
             gradient: r.gradient.each_ref().map(channels),
@@ -236,6 +242,7 @@ impl<const N: usize> TryFrom<&Plain> for Radiance<N> {
             radius: plain.radius,
             radius_min: plain.radius_bounds.0,
             radius_max: plain.radius_bounds.1,
+            ellipse: plain.ellipse,
             noise: plain.noise,
             coefficients: channels(&plain.coefficients)?,
             gradient: [channels(along_x)?, channels(along_y)?],
@@ -252,12 +259,13 @@ pub const fn kind(order: usize) -> u32 {
 }
 
 /// Floats between the id and the coefficients.
-const HEAD: usize = 10;
+const HEAD: usize = 13;
 
 impl<const N: usize> Radiance<N> {
     fn head(&self) -> [f32; HEAD] {
-        let [p, n] = [self.position, self.normal];
-        [p.x, p.y, p.z, n.x, n.y, n.z, self.radius, self.radius_min, self.radius_max, self.noise]
+        let ([p, n], [xx, xy, yy]) = ([self.position, self.normal], self.ellipse);
+        let radii = [self.radius, self.radius_min, self.radius_max];
+        [p.x, p.y, p.z, n.x, n.y, n.z, radii[0], radii[1], radii[2], xx, xy, yy, self.noise]
     }
 
     fn body(&self) -> impl Iterator<Item = &f32> {
@@ -278,10 +286,12 @@ impl<const N: usize> Radiance<N> {
         finite("radius", &[self.radius])?;
         finite("radius_min", &[self.radius_min])?;
         finite("radius_max", &[self.radius_max])?;
+        finite("ellipse", &self.ellipse)?;
         finite("noise", &[self.noise])?;
         finite("coefficients", self.coefficients.as_flattened())?;
         finite("gradient", self.gradient.as_flattened().as_flattened())?;
         site::check(self.position, self.normal, self.radius, self.radius_bounds())?;
+        site::check_ellipse(self.ellipse)?;
         if self.noise < 0.0 {
             return Err(Invalid::Range { field: "noise", value: self.noise, expected: "0 or more" });
         }
@@ -309,6 +319,7 @@ mod tests {
             radius: 2.0,
             radius_min: 0.1,
             radius_max: 10.0,
+            ellipse: [0.1, 0.05, 0.1],
             noise: 0.125,
             coefficients: coefficients(),
             gradient: [coefficients(), coefficients()],
@@ -333,17 +344,17 @@ mod tests {
 
     #[test]
     fn records_survive_packing_and_have_the_size_stated() {
-        survives::<4>(18, 200);
-        survives::<16>(20, 632);
-        survives::<36>(22, 1352);
-        survives::<64>(24, 2360);
-        survives::<100>(26, 3656);
+        survives::<4>(18, 212);
+        survives::<16>(20, 644);
+        survives::<36>(22, 1364);
+        survives::<64>(24, 2372);
+        survives::<100>(26, 3668);
     }
 
     #[test]
     fn unsound_records_are_refused_by_name() {
         type Spoil = fn(&mut Radiance<16>);
-        let spoilt: [(&str, Spoil); 13] = [
+        let spoilt: [(&str, Spoil); 15] = [
             ("position", |r| r.position.x = f32::NAN),
             ("normal", |r| r.normal.z = f32::INFINITY),
             ("normal", |r| r.normal = Vec3::new(0.0, 2.0, 0.0)),
@@ -352,6 +363,8 @@ mod tests {
             ("radius", |r| r.radius = 1e-30),
             ("radius_min", |r| r.radius_min = -1.0),
             ("radius_max", |r| r.radius_max = 0.01),
+            ("ellipse", |r| r.ellipse[2] = f32::NAN),
+            ("ellipse", |r| r.ellipse = [1.0, 2.0, 1.0]),
             ("noise", |r| r.noise = f32::NAN),
             ("noise", |r| r.noise = -1.0),
             ("coefficients", |r| r.coefficients[2][15] = f32::NAN),
@@ -369,7 +382,7 @@ mod tests {
     proptest! {
         /// Whatever bytes come, what is read from them is sound and packs to the same.
         #[test]
-        fn any_bytes_are_refused_or_sound(bytes in prop::collection::vec(any::<u8>(), 200), keep in 0usize..200) {
+        fn any_bytes_are_refused_or_sound(bytes in prop::collection::vec(any::<u8>(), 212), keep in 0usize..212) {
             let mut mixed = packed(&sound::<4>(1));
             mixed[keep..].copy_from_slice(&bytes[keep..]);
             if let Ok(record) = Radiance::<4>::decode(&mixed) {

@@ -1,8 +1,9 @@
 //! Where a record of light lies on a surface and how far it counts: what all rooms of such records have in common.
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 
 use crate::cached::{Invalid, Query};
+use crate::math::Frame;
 
 /// No scene is larger: squares of such lengths still fit a float, so nothing derived from a record overflows.
 const LENGTH_MAX: f32 = 1e18;
@@ -14,11 +15,42 @@ const RADIUS_LEAST: f32 = 1.0 / (1u64 << 32) as f32;
 /// How far, in R, a record may lie in front of a query and still count: enough for curved surfaces made of facets.
 const IN_FRONT_TOLERANCE: f32 = 0.01;
 
+/// The error e of a record (Ward 1988 eq. 5), its summand for the distance being that of the ellipse where that says more; and
+/// the summand for the turn of the normal. `None` where it does not count.
+#[inline]
+pub(crate) fn error(
+    (position, normal, ellipse): (Vec3, Vec3, [f32; 3]),
+    query: &Query,
+    radius: f32,
+    a: f32,
+) -> Option<(f32, f32)> {
+    let (mut translation, rotation) = split_sphere(position, normal, query, radius, a)?;
+    let [xx, xy, yy] = ellipse;
+    if xx + yy > 0.0 {
+        let Vec2 { x, y } = Frame::around(normal).tangential(query.position - position);
+        translation = translation.max((x * x * xx + 2.0 * x * y * xy + y * y * yy).max(0.0).sqrt());
+    }
+    Some((translation + rotation, rotation))
+}
+
+/// Whether the finite (xx, xy, yy) of a record's M are sound. A record reaches as far as R lets it at most, so an ellipse
+/// without end in some direction does no harm.
+///
+/// # Errors
+/// Where it has a negative axis.
+pub(crate) fn check_ellipse(ellipse: [f32; 3]) -> Result<(), Invalid> {
+    let [xx, xy, yy] = ellipse.map(f64::from);
+    if xx < 0.0 || yy < 0.0 || xy * xy > xx * yy * (1.0 + 1e-5) {
+        return Err(Invalid::Range { field: "ellipse", value: ellipse[1], expected: "no negative axis" });
+    }
+    Ok(())
+}
+
 /// Both summands of the error e of a record at `position` with unit `normal` that counts with `radius`, for the distance and
 /// for the turn of the normal (Ward 1988 eq. 5); `None` where their sum is not below `a`. A record in front of the query (Ward
 /// 1988 eq. 6) does not count; the test's tolerance scales with R.
 #[inline]
-pub(crate) fn error(position: Vec3, normal: Vec3, query: &Query, radius: f32, a: f32) -> Option<(f32, f32)> {
+fn split_sphere(position: Vec3, normal: Vec3, query: &Query, radius: f32, a: f32) -> Option<(f32, f32)> {
     let offset = query.position - position;
     let translation = offset.length() / radius;
     // sqrt(1 - n·n_i) without its cancellation: |n - n_i|² = 2 (1 - n·n_i) for unit vectors.

@@ -189,7 +189,8 @@ fn rendered(spec: &v1::FrameSpec) {
     let settings = Settings { spp: 1, rays: settings.rays.min(64), bounces: settings.bounces.min(2), ..settings };
     let few = settings.width.min(8) * settings.height.min(8);
     let frame = worker::frame::Frame::new(room(), Settings { width: few, height: few, ..settings });
-    let mut levels: Vec<_> = (0..frame.levels()).map(|_| Level::new(frame.settings().a, frame.settings().details)).collect();
+    let mut levels: Vec<_> =
+        (0..frame.levels()).map(|_| Level::new(frame.settings().a, frame.settings().details)).collect();
     for level in (1..=frame.levels()).rev() {
         // The fifth pass refines.
         for pass in [0, 4] {

@@ -3,10 +3,11 @@
 use std::f32::consts::SQRT_2;
 
 use cache_core::details::Details;
-use cache_core::hemisphere::{self, Cells, Estimated, Sample, Strata};
+use cache_core::hemisphere::{Cells, Estimated, Sample, Strata};
 use cache_core::id::{Origin, Random};
 use cache_core::incoming::Bands;
 use cache_core::math::Frame;
+use cache_core::mesh::turned;
 use cache_core::{Irradiance, Namespace, Packed as _, Query, Radiance, Record, RecordId, radiance};
 
 use glam::{Vec2, Vec3};
@@ -111,6 +112,7 @@ impl Gather<'_> {
         let (estimate, frame) = self.estimate(id, site, &self.strata, sum, counts);
         let (radius, radius_min) = self.radius(site, estimate.radius);
         let own = |v: Vec2| site.at.frame.tangential(frame.x * v.x + frame.y * v.y);
+        let ellipse = turned(estimate.ellipse, back(site, frame));
         Irradiance {
             id,
             position: site.at.position,
@@ -122,7 +124,7 @@ impl Gather<'_> {
             irradiance: estimate.irradiance.max(Vec3::ZERO),
             gradient_t: estimate.gradient_t.map(own),
             gradient_r: estimate.gradient_r.map(own),
-            ellipse: self.ellipse(site, frame, &estimate),
+            ellipse: limited(ellipse, site.radius_bounds.0),
             noise: estimate.noise,
         }
     }
@@ -132,9 +134,7 @@ impl Gather<'_> {
         let sum = |bands: &Bands, samples: &[Sample]| bands.estimate::<N>(samples, self.details);
         let (estimate, frame) = self.estimate(id, site, &self.bands, sum, counts);
         let (radius, radius_min) = self.radius(site, estimate.radius);
-        // From the gather's frame back to that of the site.
-        let turn = site.at.frame.tangential(frame.x) * Vec2::new(1.0, -1.0);
-        let estimate = estimate.turned(turn);
+        let estimate = estimate.turned(back(site, frame));
         Radiance {
             id,
             position: site.at.position,
@@ -142,6 +142,7 @@ impl Gather<'_> {
             radius,
             radius_min,
             radius_max: site.radius_bounds.1,
+            ellipse: limited(estimate.ellipse, site.radius_bounds.0),
             noise: estimate.noise,
             coefficients: estimate.coefficients,
             gradient: estimate.gradient,
@@ -159,7 +160,7 @@ impl Gather<'_> {
     ) -> (E, Frame) {
         let mut random = Random::of(id);
         // A turn of the cells about the normal, so that neighbouring records do not err alike.
-        let frame = turned(site.at.frame, random.uniform());
+        let frame = spun(site.at.frame, random.uniform());
         let mut sampler = Sampler::Stream(random);
         let mut gather =
             |cells: &C| sum(cells, &self.tracer.hemisphere(&site.at, frame, self.level, cells, &mut sampler, counts));
@@ -185,26 +186,12 @@ impl Gather<'_> {
     }
 }
 
-impl Gather<'_> {
-    /// The estimate's ellipse along the site's tangents, no axis shorter than the least R.
-    fn ellipse(&self, site: &Site, frame: Frame, estimate: &hemisphere::Estimate) -> [f32; 3] {
-        let [xx, xy, yy] = estimate.ellipse;
-        if xx + yy == 0.0 || !(xx + yy).is_finite() {
-            return [0.0; 3];
-        }
-        // Both tangents of the gather in those of the site: a turn.
-        let Vec2 { x: c, y: s } = site.at.frame.tangential(frame.x);
-        let turned = [
-            xx * c * c - 2.0 * xy * s * c + yy * s * s,
-            (xx - yy) * s * c + xy * (c * c - s * s),
-            xx * s * s + 2.0 * xy * s * c + yy * c * c,
-        ];
-        limited(turned, site.radius_bounds.0)
-    }
-}
-
-/// The ellipse with no semi-axis shorter than `least`, and none longer than [`ELONGATION`] times the other.
+/// The ellipse with no semi-axis shorter than `least`, and none longer than [`ELONGATION`] times the other; none at all where
+/// it says nothing.
 fn limited([xx, xy, yy]: [f32; 3], least: f32) -> [f32; 3] {
+    if xx + yy == 0.0 || !(xx + yy).is_finite() {
+        return [0.0; 3];
+    }
     let most = (least * least).recip();
     let (middle, half) = ((xx + yy) * 0.5, (xx - yy) * 0.5);
     let spread = (half * half + xy * xy).sqrt();
@@ -217,8 +204,13 @@ fn limited([xx, xy, yy]: [f32; 3], least: f32) -> [f32; 3] {
     [middle + half * scale, xy * scale, middle - half * scale]
 }
 
+/// The turn from a gather's frame back to that of its site, (cosine, sine).
+fn back(site: &Site, frame: Frame) -> Vec2 {
+    site.at.frame.tangential(frame.x) * Vec2::new(1.0, -1.0)
+}
+
 /// The frame turned about its normal by a fraction of a full turn.
-fn turned(frame: Frame, fraction: f32) -> Frame {
+fn spun(frame: Frame, fraction: f32) -> Frame {
     let (s, c) = cache_core::math::sin_cos(fraction * std::f32::consts::TAU);
     Frame { x: frame.x * c + frame.y * s, y: frame.y * c - frame.x * s, z: frame.z }
 }

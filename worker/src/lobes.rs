@@ -22,10 +22,10 @@ use crate::settings::Method;
 pub const ORDERS: [usize; 5] = [2, 4, 6, 8, 10];
 
 /// Of the energy a surface reflects, what records may miss.
-const MISSED: f32 = 0.05;
+const MISSED: f32 = 0.1;
 
 /// Cosine of the outgoing direction a material's order is chosen for.
-const VIEWED: f32 = 0.5;
+const VIEWED: f32 = 0.3;
 
 /// ∫ (cos θ / π)² dω.
 const DIFFUSE_ENERGY: f32 = 2.0 / 3.0 * FRAC_1_PI;
