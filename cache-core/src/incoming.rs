@@ -124,10 +124,15 @@ impl Bands {
     pub fn estimate<const N: usize>(&self, samples: &[Sample], details: &Details) -> Estimate<N> {
         assert_eq!(samples.len(), self.rays());
         let solid_angle = TAU / self.rays() as f32;
+        // What is the same all round is known without error: all other harmonics integrate to 0. Noise is of the rest.
+        let mean = samples.iter().map(|s| s.radiance).sum::<Rgb>() / self.rays() as f32;
         let mut sums = [[0.0f64; N]; 3];
+        for (sum, mean) in sums.iter_mut().zip(mean.to_array()) {
+            sum[0] = f64::from(mean) * std::f64::consts::TAU.sqrt();
+        }
         for sample in samples {
             let h = harmonics::<N>(sample.direction.as_dvec3());
-            for (sum, light) in sums.iter_mut().zip((sample.radiance * solid_angle).to_array()) {
+            for (sum, light) in sums.iter_mut().zip(((sample.radiance - mean) * solid_angle).to_array()) {
                 sum.iter_mut().zip(&h).for_each(|(sum, h)| *sum += f64::from(light) * h);
             }
         }

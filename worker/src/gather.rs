@@ -188,20 +188,21 @@ impl Gather<'_> {
 
 /// The ellipse with no semi-axis shorter than `least`, and none longer than [`ELONGATION`] times the other; none at all where
 /// it says nothing.
-fn limited([xx, xy, yy]: [f32; 3], least: f32) -> [f32; 3] {
+fn limited(ellipse: [f32; 3], least: f32) -> [f32; 3] {
+    // In units of the least semi-axis, so that squares fit a float whatever the unit of length.
+    let [xx, xy, yy] = ellipse.map(|m| m * least * least);
     if xx + yy == 0.0 || !(xx + yy).is_finite() {
         return [0.0; 3];
     }
-    let most = (least * least).recip();
     let (middle, half) = ((xx + yy) * 0.5, (xx - yy) * 0.5);
     let spread = (half * half + xy * xy).sqrt();
     // Eigenvalues: squared reciprocals of the minor and the major semi-axis.
     let (minor, major) = (middle + spread, middle - spread);
-    let bounded = minor.min(most);
+    let bounded = minor.min(1.0);
     let bounds = (bounded, major.max(bounded / (ELONGATION * ELONGATION)).min(bounded));
     let (middle, scale) =
         ((bounds.0 + bounds.1) * 0.5, if spread > 0.0 { (bounds.0 - bounds.1) * 0.5 / spread } else { 0.0 });
-    [middle + half * scale, xy * scale, middle - half * scale]
+    [middle + half * scale, xy * scale, middle - half * scale].map(|m| m / least / least)
 }
 
 /// The turn from a gather's frame back to that of its site, (cosine, sine).
