@@ -393,10 +393,11 @@ impl Render<'_> {
             return Ok(());
         }
         say::result(format_args!(
-            "{} and {}: {seconds:.1} s, {} records, {} rounds{}{}",
+            "{} and {}: {seconds:.1} s, {} records{}, {} rounds{}{}",
             self.args.output.display(),
             self.args.png().display(),
             done.records,
+            of_radiance(done),
             done.rounds,
             job.forecast.map_or(String::new(), |(asked, forecast)| {
                 let believed = 100.0 * believed(&forecast, done).total();
@@ -405,6 +406,12 @@ impl Render<'_> {
             gathered_per_sample(done)
         ))
     }
+}
+
+/// How many of the records gathered are of radiance, if any.
+fn of_radiance(done: &v1::FrameDone) -> String {
+    let count = done.counts.iter().find(|count| count.name == "records.radiance");
+    count.map_or(String::new(), |count| format!(" ({} of radiance)", count.value))
 }
 
 /// Where records did not pay, if that was more than here and there.

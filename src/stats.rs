@@ -81,7 +81,7 @@ impl Stats {
             "digest": hex(&done.digest),
             "wall_seconds": wall,
             "cpu_seconds": cpu,
-            "records": { "irradiance": records },
+            "records": records,
             "rays": { "path": by_phase("rays.path.", whole), "shadow": by_phase("rays.shadow.", whole) },
             "queries": count("queries"),
             "misses": count("misses"),
@@ -175,7 +175,7 @@ mod tests {
         let json = stats.json(Map::new(), &done);
         assert_eq!(json["digest"], "ab".repeat(16));
         assert_eq!(json["cpu_seconds"]["level 2"], 1.5);
-        assert_eq!(json["records"]["irradiance"], json!({ "level 2": 12, "base": 0, "reused": 0, "total": 12 }));
+        assert_eq!(json["records"], json!({ "level 2": 12, "base": 0, "reused": 0, "total": 12 }));
         assert_eq!(json["rays"]["path"]["pixels"], 9);
         assert_eq!(json["bytes"]["total"], 111);
         assert_eq!((&json["queries"], &json["misses"], &json["rounds"]), (&json!(5), &json!(0), &json!(3)));

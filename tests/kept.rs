@@ -19,7 +19,7 @@ fn cached(cache: &Path, scene: &str, more: &[&str]) -> (Run, String) {
 
 impl Run {
     fn count(&self, name: &str) -> u64 {
-        self.stats["records"]["irradiance"][name].as_u64().unwrap_or(0)
+        self.stats["records"][name].as_u64().unwrap_or(0)
     }
 
     /// Records the frame gathered.
@@ -53,6 +53,20 @@ fn a_second_render_gathers_nothing_and_a_moved_camera_only_what_it_newly_sees() 
     // Records another view added clamp those of the first here and there: it mends a few holes.
     let (back, _) = cached(cache.path(), "cornell.glb", &[]);
     assert!(back.gathered() * 100 < first.count("total"), "{}", back.stats);
+}
+
+#[test]
+fn a_second_view_of_a_glossy_floor_needs_few_new_records() {
+    let cache = tempfile::tempdir().expect("temporary directory");
+    let (first, _) = cached(cache.path(), "glossy-floor.glb", &["--method", "radiance"]);
+    assert!(first.count("radiance") > 100, "{}", first.stats);
+    let view = cache.path().join("aside.vf");
+    std::fs::write(&view, "rvu -vtv -vp 0.33 0.30 -0.78 -vd -0.06 -0.03 1 -vu 0 1 0 -vh 39 -vv 39\n").expect("written");
+    let (moved, _) =
+        cached(cache.path(), "glossy-floor.glb", &["--method", "radiance", "--camera", &view.display().to_string()]);
+    let (new, all) = (moved.gathered(), first.gathered());
+    println!("{new} new records, {} of radiance, after {all}", moved.count("radiance"));
+    assert!(new * 3 < all && moved.count("radiance") * 3 < first.count("radiance"), "{}", moved.stats);
 }
 
 #[test]

@@ -92,7 +92,7 @@ fn run(frame: &Frame, work: &Work) -> Option<Done> {
 
 impl Done {
     /// The counts of `Complete`: `cpu_seconds.PHASE`, `records.PHASE`, `rays.path.PHASE`, `rays.shadow.PHASE` (PHASE is
-    /// `level N` or `pixels`), `cpu_seconds.tests` (of those of the levels, what was not spent on gathers), `proposals`,
+    /// `level N` or `pixels`), `records.radiance` (of those of level 1), `cpu_seconds.tests` (of those of the levels, what was not spent on gathers), `proposals`,
     /// `queries`, `misses`, `regathers` (of the misses, samples of pixels that gathered for themselves), `dense` (candidates left
     /// alone where records would be as dense as pixels), `reused` (of the records, those found), and of bytes on the wire `bytes.inserted` and
     /// `bytes.subscribed` (packed records), `bytes.tiles` (packed pixels).
@@ -102,11 +102,13 @@ impl Done {
             level => format!("level {level}"),
         };
         let proposals = self.records.iter().filter(|(_, r)| matches!(r, Record::Shrink(_))).count();
+        let glossy = self.records.iter().filter(|(_, r)| matches!(r, Record::Radiance(_))).count();
         let tiles: usize = self.tiles.iter().map(|t| t.pixels.len()).sum();
         let all = [
             (format!("cpu_seconds.{phase}"), self.cpu_seconds),
             ("cpu_seconds.tests".into(), self.counts.test_seconds),
             (format!("records.{phase}"), (self.records.len() - proposals) as f64),
+            ("records.radiance".into(), glossy as f64),
             ("proposals".into(), proposals as f64),
             (format!("rays.path.{phase}"), self.counts.path_rays as f64),
             (format!("rays.shadow.{phase}"), self.counts.shadow_rays as f64),

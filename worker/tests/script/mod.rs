@@ -100,7 +100,7 @@ impl Script {
     pub fn insert(&self, namespace: Namespace, records: &[(Tag, Record)]) {
         self.with(|state| {
             let log = state.logs.entry(namespace).or_default();
-            records.iter().for_each(|(tag, record)| _ = log.insert(*tag, *record));
+            records.iter().for_each(|(tag, record)| _ = log.insert(*tag, record.clone()));
         });
     }
 
@@ -117,7 +117,7 @@ impl Script {
 /// Digest of the records below a position.
 fn prefix(log: &Log, position: usize) -> Digest {
     let mut set = Log::default();
-    log.since(0).iter().take(position).for_each(|(tag, record)| _ = set.insert(*tag, *record));
+    log.since(0).iter().take(position).for_each(|(tag, record)| _ = set.insert(*tag, record.clone()));
     set.digest()
 }
 
@@ -142,7 +142,8 @@ impl v1::cache_server::Cache for Script {
             let (mut added, mut position) = (0, 0);
             for (namespace, tag, records) in batches {
                 let log = state.logs.entry(namespace).or_default();
-                added += records.into_iter().filter(|r| log.insert(tag, *r) == Inserted::Added).count() as u64;
+                added +=
+                    records.into_iter().filter(|r| log.insert(tag, Record::clone(r)) == Inserted::Added).count() as u64;
                 position = log.position() as u64;
             }
             Ok(Response::new(v1::InsertResponse { added, position }))
@@ -178,7 +179,7 @@ impl v1::cache_server::Cache for Script {
             let first = v1::SubscribeResponse { batch: None, position: position as u64, end };
             let mut alive = sender.send(Ok(first)).await.is_ok();
             while alive {
-                let next = script.lock().logs.get(&namespace).and_then(|log| log.since(position).first().copied());
+                let next = script.lock().logs.get(&namespace).and_then(|log| log.since(position).first().cloned());
                 alive = if changed.borrow_and_update().0 != life {
                     drop(sender.send(Err(Status::unavailable("gone"))).await);
                     false
