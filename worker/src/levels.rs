@@ -159,7 +159,7 @@ impl Level {
 }
 
 /// Sealed records of radiance, of whatever order.
-pub trait Glossy: Send + Sync {
+trait Glossy: Send + Sync {
     /// Adds records of its order, and proposals that records shrink.
     fn unite(&mut self, new: &[&Record]);
     /// The same set again.
