@@ -4,6 +4,7 @@
 use std::error::Error;
 
 use cache_core::details::Details;
+use cache_core::rounds::RANKS;
 use worker::frame::Frame;
 use worker::lobes::ORDERS;
 use worker::pilot;
@@ -14,27 +15,47 @@ use worker::task::CpuClock;
 
 use crate::judge::{SIZE, judge, load, reduce, rgb, settings};
 use crate::own;
-use crate::results::{Point, Results};
+use crate::report::{Curve, Report, logarithmic};
 use crate::rounded::rounded;
+
+/// Scenes there are.
+const SCENES: [&str; 3] = ["floor", "curved", "coated"];
+
+/// Allowed errors adaptive caching is measured at: without it, and with it.
+const ADAPTIVE: [&[f32]; 2] = [&[0.8, 0.6, 0.4, 0.3, 0.2], &[0.8, 0.6, 0.4]];
 
 /// What to measure.
 #[derive(clap::Args)]
 pub struct GlossArgs {
     /// Roughness alpha of the glossy surfaces
-    #[arg(default_values_t = [0.6f32, 0.3, 0.2, 0.15, 0.1, 0.05])]
+    #[arg(default_values_t = [0.6f32, 0.4, 0.3, 0.2, 0.15, 0.1])]
     alpha: Vec<f32>,
-    /// What glosses: the floor, a ball and a torus in place of the blocks, or a coat on everything
-    #[arg(long, value_parser = ["floor", "curved", "coated"], default_value = "floor")]
+    /// What glosses: the floor of the box, a ball and a torus in place of its blocks, or a coat on everything
+    #[arg(long, value_parser = SCENES, default_value = "floor")]
     scene: String,
+    /// Error to ask of sampling, of records wherever there is gloss, and of auto; each order of records is measured as it is
+    #[arg(long, default_value_t = 0.02)]
+    error: f32,
     /// Edge of the pictures, a multiple of 128
     #[arg(long, default_value_t = SIZE as u32)]
     edge: u32,
-    /// Errors to ask of each method
-    #[arg(long, value_delimiter = ',', default_values_t = [0.08f32, 0.04, 0.02])]
-    error: Vec<f32>,
+    /// Adaptive caching against the same number of records without it, in place of all this
+    #[arg(long)]
+    adaptive: bool,
     /// Keep table and chart in bench/results
     #[arg(long)]
     save: bool,
+}
+
+/// One picture.
+struct Measured {
+    renderer: String,
+    alpha: f32,
+    /// Percent.
+    rmse: f64,
+    worst: f64,
+    /// CPU seconds.
+    cpu: f64,
 }
 
 /// Prints one line a picture.
@@ -43,7 +64,10 @@ pub struct GlossArgs {
 /// The disk's.
 pub fn run(args: &GlossArgs) -> Result<(), Box<dyn Error>> {
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
-    let mut results = Results::open("gloss")?;
+    let arguments: Vec<_> = std::env::args().skip(1).collect();
+    let mut report = Report::begin(&format!("cargo run --release -p ambience-bench -- {}", arguments.join(" ")));
+    report.line("RMSE, bias, worst block; CPU seconds; records of irradiance and of radiance; passes, tests as a share of the fill");
+    let mut all = Vec::new();
     for &alpha in &args.alpha {
         let name = format!("{}-{alpha}", args.scene);
         let (scene, camera) = match args.scene.as_str() {
@@ -52,44 +76,78 @@ pub fn run(args: &GlossArgs) -> Result<(), Box<dyn Error>> {
             _ => floor(alpha),
         };
         let truth = own::reference(&name, &scene, &camera)?;
-        let mut measure = |renderer: &str, setting: String, settings: Settings, error: Option<f32>| {
-            let ((pixels, records), seconds) = one_thread.install(|| {
+        let base = Settings { width: args.edge, height: args.edge, ..settings(camera, "full") };
+        let mut measure = |renderer: &str, settings: Settings, error: Option<f32>| {
+            let (pixels, filled, fill, cpu) = one_thread.install(|| {
                 let clock = CpuClock::start();
                 let frame = Frame::new(scene.clone(), settings);
                 let frame = if let Some(error) = error { pilot::choose(frame, error).0 } else { frame };
-                let levels = solo::fill(&frame, Order::Rounds);
-                let records = levels.first().map_or([0; 2], |l| [l.irradiance.len(), l.len() - l.irradiance.len()]);
-                ((solo::pixels(&frame, &levels).0, records), clock.seconds())
+                let before = clock.seconds();
+                let filled = solo::fill_ranks(&frame, Order::Rounds, RANKS);
+                let fill = clock.seconds() - before;
+                (solo::pixels(&frame, &filled.levels).0, filled, fill, clock.seconds())
             });
-            let setting = format!("{setting}; {} + {} records", records[0], records[1]);
-            let verdict = judge(&reduce(&rgb(&pixels)), &truth);
-            results.put(Point::new(name.clone(), args.edge, renderer.into(), setting, [seconds; 2], &verdict));
+            let v = judge(&reduce(&rgb(&pixels)), &truth);
+            let [rmse, bias, worst, tests] =
+                [v.rmse, v.bias, v.worst, filled.counts.test_seconds / fill].map(|v| 100.0 * v);
+            let (first, edge) = (&filled.levels[0], args.edge);
+            let [irradiance, radiance] = [first.irradiance.len(), first.len() - first.irradiance.len()];
+            report.line(&format!(
+                "{name:12} {edge}x{edge} {renderer:24} {rmse:5.2}% {bias:+5.2}% {worst:5.2}% {cpu:7.2} s {irradiance:6} {radiance:6} {:3} {tests:4.1}%",
+                filled.passes,
+            ));
+            all.push(Measured { renderer: renderer.into(), alpha, rmse, worst, cpu });
         };
-        let base = Settings { width: args.edge, height: args.edge, ..settings(camera, "full") };
         let with = |method| Settings { method, ..base.clone() };
-        for &error in &args.error {
-            for (renderer, method) in
-                [("sampling", Method::Irradiance), ("radiance", Method::Radiance), ("auto", Method::Auto)]
-            {
-                measure(renderer, format!("--error {error}"), with(method), Some(error));
+        if args.adaptive {
+            for (adaptive, allowed) in [false, true].into_iter().zip(ADAPTIVE) {
+                for &a in allowed {
+                    let details = Details { adaptive, ..Details::default() };
+                    let settings = Settings { a, rays: 1024, details, ..with(Method::Radiance) };
+                    measure(&format!("{} a {a}", if adaptive { "adaptive" } else { "plain" }), settings, None);
+                }
             }
+            continue;
+        }
+        let methods = [("sampling", Method::Irradiance), ("radiance", Method::Radiance), ("auto", Method::Auto)];
+        for (renderer, method) in methods {
+            measure(renderer, with(method), Some(args.error));
         }
         for order in ORDERS {
             let details = Details { order: Some(order), ..Details::default() };
-            let settings = Settings { details, rays: 2048, ..with(Method::Radiance) };
-            measure(&format!("order {order}"), "--rays 2048".into(), settings, None);
+            measure(&format!("order {order}"), Settings { details, rays: 2048, ..with(Method::Radiance) }, None);
         }
     }
-    if args.save { results.save() } else { Ok(()) }
+    if args.save {
+        let name = format!("gloss-{}-{}{}", args.scene, args.edge, if args.adaptive { "-adaptive" } else { "" });
+        report.save(&name)?;
+        if !args.adaptive {
+            logarithmic(&name, "alpha", &panels(&args.scene, &all))?;
+        }
+    }
+    Ok(())
+}
+
+/// Error, worst block and cost over alpha.
+fn panels(scene: &str, all: &[Measured]) -> Vec<(String, Vec<Curve>)> {
+    let values: [(&str, fn(&Measured) -> f64); 3] =
+        [("RMSE, %", |m| m.rmse), ("worst block, %", |m| m.worst), ("CPU seconds", |m| m.cpu)];
+    let first = all.first().map(|m| m.alpha);
+    let renderers: Vec<_> = all.iter().filter(|m| Some(m.alpha) == first).map(|m| m.renderer.as_str()).collect();
+    let curve = |renderer: &str, value: fn(&Measured) -> f64| {
+        let points = all.iter().filter(|m| m.renderer == renderer);
+        (renderer.to_string(), points.map(|m| (f64::from(m.alpha), value(m))).collect())
+    };
+    let panel = |(what, value)| (format!("{scene}: {what}"), renderers.iter().map(|r| curve(r, value)).collect());
+    values.into_iter().map(panel).collect()
 }
 
 /// The box with a coat on all that is diffuse.
 fn coated(alpha: f32) -> (Scene, Camera) {
     let (mut scene, camera) = load("cornell.glb");
     for material in &mut scene.materials {
-        let roughness = alpha.sqrt();
-        material.surface =
-            Surface::Gltf { metallic: 0.0, roughness, specular: 1.0, specular_color: Rgb::ONE, ior: 1.5 };
+        let (metallic, roughness) = (0.0, alpha.sqrt());
+        material.surface = Surface::Gltf { metallic, roughness, specular: 1.0, specular_color: Rgb::ONE, ior: 1.5 };
     }
     (scene, camera)
 }
@@ -98,9 +156,7 @@ fn coated(alpha: f32) -> (Scene, Camera) {
 fn floor(alpha: f32) -> (Scene, Camera) {
     let (mut scene, camera) = load("glossy-floor.glb");
     for material in &mut scene.materials {
-        if let Surface::Gltf { metallic, roughness, .. } = &mut material.surface
-            && *metallic > 0.0
-        {
+        if let Surface::Gltf { metallic: 1.0, roughness, .. } = &mut material.surface {
             *roughness = alpha.sqrt();
         }
     }

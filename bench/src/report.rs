@@ -116,14 +116,15 @@ pub fn curves(name: &str, panels: &[(&str, Vec<Curve>)]) -> Result<(), Box<dyn E
     })
 }
 
-/// Draws panels beside each other, each of curves over CPU seconds, both axes logarithmic, to bench/results/NAME.svg.
+/// Draws panels beside each other, each of curves over what is named `below`, both axes logarithmic, to
+/// bench/results/NAME.svg.
 ///
 /// # Errors
 /// The disk's.
-pub fn costs(name: &str, panels: &[(String, Vec<Curve>)]) -> Result<(), Box<dyn Error>> {
+pub fn logarithmic(name: &str, below: &str, panels: &[(String, Vec<Curve>)]) -> Result<(), Box<dyn Error>> {
     beside(name, panels, |area, title, curves| {
         let [x, y] = extent(curves).map(|(low, high)| (low / 1.5..high * 1.5).log_scale());
-        panel(area, title, "CPU seconds", x, y, curves, SeriesLabelPosition::LowerLeft)
+        panel(area, title, below, x, y, curves, SeriesLabelPosition::LowerLeft)
     })
 }
 
