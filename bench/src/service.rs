@@ -42,9 +42,20 @@ const KINDS: [(Kind, &str); 6] = [
     (Kind::Device, "durable on the device"),
 ];
 
+/// What is measured.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, clap::ValueEnum)]
+enum Part {
+    In,
+    Out,
+    Queries,
+    Latency,
+}
+
 /// Arguments of the benchmark.
 #[derive(Clone, Debug, clap::Args)]
 pub struct ServiceArgs {
+    /// What is measured; everything, if nothing is named
+    parts: Vec<Part>,
     /// Rounds; the median counts
     #[arg(long, default_value_t = 5)]
     rounds: usize,
@@ -61,15 +72,18 @@ pub fn run(args: &ServiceArgs) -> Result<(), Box<dyn Error>> {
     let mut report = Report::begin("cargo run --release -p ambience-bench -- service");
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
     let mut chart = Vec::new();
+    let named = |part| args.parts.is_empty() || args.parts.contains(&part);
     runtime.block_on(async {
-        for size in [4096, 256] {
+        for size in [4096, 256].into_iter().filter(|_| named(Part::In)) {
             insert(&mut report, &mut chart, args.rounds, size).await?;
         }
-        for subscribers in [1, 4] {
+        for subscribers in [1, 4].into_iter().filter(|_| named(Part::Out)) {
             subscribe(&mut report, &mut chart, args.rounds, subscribers).await?;
         }
-        query(&mut report, &mut chart, args.rounds).await?;
-        for load in [false, true] {
+        if named(Part::Queries) {
+            query(&mut report, &mut chart, args.rounds).await?;
+        }
+        for load in [false, true].into_iter().filter(|_| named(Part::Latency)) {
             latency(&mut report, load).await?;
         }
         Ok::<_, Box<dyn Error>>(())

@@ -46,7 +46,8 @@ impl Device {
 }
 
 /// What a file was before it was changed, for as long as nobody knows whether it is sound: redb writes to a file while it
-/// is opened, and a damaged one is to be kept as it was found.
+/// is opened, and a damaged one is to be kept as it was found. What was overwritten or cut off is held in memory; a process
+/// killed before it is taken back leaves the file as any crash does.
 #[derive(Clone, Default, Debug)]
 pub(super) struct Undo(Arc<Mutex<Option<Vec<Before>>>>);
 
