@@ -68,7 +68,7 @@ fn path_tracing_is_unbiased_on_all_scenes_at_both_depths() {
 fn white_furnace_is_exact_for_both_methods_and_both_formats() {
     for file in ["white-furnace.glb", "white-furnace.rad"] {
         for (depth, exact) in [("one", 1.75), ("full", 2.0)] {
-            for method in Method::ALL {
+            for method in [Method::Path, Method::Auto] {
                 let (scene, camera) = load(file);
                 let spp = if method == Method::Path { 64 } else { 4 };
                 let picture = render(scene, Settings { method, spp, ..settings(camera, depth) });

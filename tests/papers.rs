@@ -1,7 +1,7 @@
 //! What the papers of irradiance caching report of whole pictures, measured again. What did not come out as reported says so.
 
 use ambience_bench::judge::{judge, load, reference, rgb, settings};
-use cache_core::details::{Details, Distance, Gradients, Metric, Spacing, Weighting};
+use cache_core::details::{Details, Gradients, Metric, Spacing, Weighting};
 use worker::frame::{CHANNELS, Frame};
 use worker::settings::Settings;
 use worker::solo::{self, Order};

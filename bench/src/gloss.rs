@@ -15,7 +15,7 @@ use worker::task::CpuClock;
 
 use crate::judge::{SIZE, judge, load, reduce, rgb, settings};
 use crate::own;
-use crate::report::{Curve, Report, logarithmic};
+use crate::report::{Curve, Report, SeriesLabelPosition, logarithmic};
 use crate::rounded::rounded;
 
 /// Scenes there are.
@@ -122,7 +122,7 @@ pub fn run(args: &GlossArgs) -> Result<(), Box<dyn Error>> {
         let name = format!("gloss-{}-{}{}", args.scene, args.edge, if args.adaptive { "-adaptive" } else { "" });
         report.save(&name)?;
         if !args.adaptive {
-            logarithmic(&name, "alpha", &panels(&args.scene, &all))?;
+            logarithmic(&name, "alpha", SeriesLabelPosition::UpperRight, &panels(&args.scene, &all))?;
         }
     }
     Ok(())

@@ -4,6 +4,7 @@ use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+pub use plotters::chart::SeriesLabelPosition;
 use plotters::coord::Shift;
 use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
 use plotters::prelude::*;
@@ -121,10 +122,15 @@ pub fn curves(name: &str, panels: &[(&str, Vec<Curve>)]) -> Result<(), Box<dyn E
 ///
 /// # Errors
 /// The disk's.
-pub fn logarithmic(name: &str, below: &str, panels: &[(String, Vec<Curve>)]) -> Result<(), Box<dyn Error>> {
+pub fn logarithmic(
+    name: &str,
+    below: &str,
+    legend: SeriesLabelPosition,
+    panels: &[(String, Vec<Curve>)],
+) -> Result<(), Box<dyn Error>> {
     beside(name, panels, |area, title, curves| {
         let [x, y] = extent(curves).map(|(low, high)| (low / 1.5..high * 1.5).log_scale());
-        panel(area, title, below, x, y, curves, SeriesLabelPosition::LowerLeft)
+        panel(area, title, below, x, y, curves, legend.clone())
     })
 }
 
@@ -176,7 +182,12 @@ where
         .set_label_area_size(LabelAreaPosition::Left, 60)
         .set_label_area_size(LabelAreaPosition::Bottom, 36)
         .build_cartesian_2d(x, y)?;
-    chart.configure_mesh().x_desc(below).x_label_formatter(&f64::to_string).draw()?;
+    chart
+        .configure_mesh()
+        .x_desc(below)
+        .x_labels(6)
+        .x_label_formatter(&|x| ((x * 1e4).round() / 1e4).to_string())
+        .draw()?;
     for (at, (label, points)) in curves.iter().enumerate() {
         let color = Palette99::pick(at).to_rgba();
         chart
