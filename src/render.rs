@@ -14,6 +14,7 @@ use worker::film::{self, Film};
 use worker::frame::Frame;
 use worker::pilot::{self, Errors, Forecast};
 use worker::scene::{self, Scene};
+use worker::scenes;
 use worker::settings::{ALL_BOUNCES, Settings};
 use worker::spec;
 use worker::task;
@@ -245,6 +246,7 @@ impl Render<'_> {
             Ok(events) => events,
             Err(end) => return Ok(end),
         };
+        let mut frame = 0;
         loop {
             let event = tokio::select! {
                 event = events.message() => event,
@@ -269,8 +271,16 @@ impl Render<'_> {
                     film.add(tile.tile, &tile.pixels).map_err(Failure::failed)?;
                 }
                 Some(FrameEvent::Declined(declined)) => self.decline(declined)?,
+                Some(FrameEvent::SceneWanted(_)) => {
+                    let (frames, path) = (frames.clone(), job.spec.scene.clone());
+                    // If it fails, the worker that asked says so.
+                    tokio::spawn(async move { scenes::offer(&frames, frame, path.as_ref()).await });
+                }
                 Some(FrameEvent::Done(done)) => return Ok(End::Done(done)),
-                Some(FrameEvent::Opened(opened)) => self.opened(opened),
+                Some(FrameEvent::Opened(opened)) => {
+                    frame = opened.frame;
+                    self.opened(opened);
+                }
                 None => {}
             }
         }

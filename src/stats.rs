@@ -54,7 +54,7 @@ impl Stats {
     ///
     /// `bytes` counts packed records and packed pixels only, where they enter the wire or leave it: inserted by workers,
     /// received by workers' subscriptions, sent by workers in tiles, received here in tiles. Message framing, HTTP/2 and
-    /// retries are not in it.
+    /// retries are in `hosts` only, which counts what went through the sockets of each machine's workers.
     pub fn json(mut self, told: Map<String, Value>, done: &v1::FrameDone) -> Value {
         self.end();
         let counts: BTreeMap<&str, f64> = done.counts.iter().map(|c| (c.name.as_str(), c.value)).collect();
@@ -95,6 +95,7 @@ impl Stats {
                 "tiles_received": self.tile_bytes,
                 "total": whole(bytes + self.tile_bytes as f64),
             },
+            "hosts": hosts(done),
             "rounds": done.rounds,
             "passes": done.passes,
             "proposals": count("proposals"),
@@ -109,6 +110,16 @@ impl Stats {
         }
         Value::Object(object)
     }
+}
+
+/// What the workers' machines used, by name; how long an answer took is a mean, where one was waited for.
+fn hosts(done: &v1::FrameDone) -> Map<String, Value> {
+    let told = |host: &v1::HostUse| {
+        let trips = host.round_trips;
+        let ms = (trips > 0).then(|| host.round_trip_seconds / trips as f64 * 1e3);
+        json!({ "bytes_sent": host.sent_bytes, "bytes_received": host.received_bytes, "round_trip_ms": ms })
+    };
+    done.hosts.iter().map(|host| (host.host.clone(), told(host))).collect()
 }
 
 fn whole(value: f64) -> Value {
@@ -167,6 +178,12 @@ mod tests {
                 count("bytes.inserted", 100.0),
                 count("queries", 5.0),
             ],
+            hosts: vec![v1::HostUse {
+                host: "b".into(),
+                round_trips: 4,
+                round_trip_seconds: 0.1,
+                ..Default::default()
+            }],
             ..Default::default()
         };
         let mut stats = Stats { tile_bytes: 11, ..Stats::default() };
@@ -178,6 +195,7 @@ mod tests {
         assert_eq!(json["records"], json!({ "level 2": 12, "base": 0, "reused": 0, "total": 12 }));
         assert_eq!(json["rays"]["path"]["pixels"], 9);
         assert_eq!(json["bytes"]["total"], 111);
+        assert_eq!(json["hosts"]["b"], json!({ "bytes_sent": 0, "bytes_received": 0, "round_trip_ms": 25.0 }));
         assert_eq!((&json["queries"], &json["misses"], &json["rounds"]), (&json!(5), &json!(0), &json!(3)));
         let wall = json["wall_seconds"].as_object().expect("object");
         assert!(wall.contains_key("load") && wall.contains_key("pixels") && wall.contains_key("total"));

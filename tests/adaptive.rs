@@ -16,6 +16,7 @@ use worker::frame::Frame;
 use worker::settings::Settings;
 use worker::solo::{self, Filled, Order};
 use worker::spec;
+use worker::traffic::Traffic;
 
 fn adaptive() -> Details {
     Details { adaptive: true, ..Details::default() }
@@ -81,7 +82,7 @@ async fn farmed(spec: v1::FrameSpec, workers: usize) -> (Vec<Vec<u8>>, v1::Frame
         drop(serve_on(node, ReceiverStream::new(accepted), std::future::pending()).await);
     });
     for number in 0..workers {
-        let worker = Arc::new(Worker::<Frame>::new(format!("w{number}"), line.clone()));
+        let worker = Arc::new(Worker::<Frame>::new(format!("w{number}"), line.clone(), Traffic::default()));
         tasks.spawn(async move { drop(worker.work(1 + number % 2).await) });
     }
     let request = v1::OpenRequest { spec: Some(spec), version: VERSION.into(), ..Default::default() };

@@ -17,6 +17,7 @@ use cache_proto::{VERSION, v1};
 use worker::client;
 use worker::farm::Worker;
 use worker::job::Known;
+use worker::traffic::Traffic;
 
 use crate::host::{self, Host, Kind, Usage};
 use crate::report::{Curve, Report, curves, quantile};
@@ -159,7 +160,8 @@ fn frame(args: &FarmArgs, workers: u32) -> Result<Run, Box<dyn Error>> {
     let (over, visible) = look();
     let result = runtime.block_on(async {
         for number in 0..workers {
-            let worker = Arc::new(Worker::<Pretended>::new(format!("simulated-{number}"), host.connect()));
+            let worker =
+                Arc::new(Worker::<Pretended>::new(format!("simulated-{number}"), host.connect(), Traffic::default()));
             tokio::spawn(async move {
                 let lost = worker.work(1).await;
                 eprintln!("simulated-{number}: {lost}");
@@ -183,7 +185,7 @@ fn frame(args: &FarmArgs, workers: u32) -> Result<Run, Box<dyn Error>> {
                 },
                 Event::Done(done) => break done,
                 Event::Declined(declined) => return Err(declined.reason.into()),
-                Event::Opened(_) | Event::Tile(_) => continue,
+                Event::Opened(_) | Event::Tile(_) | Event::SceneWanted(_) => continue,
             };
             if now != phase.1 {
                 phases.insert(phase.1, phase.0.elapsed().as_secs_f64());

@@ -14,6 +14,7 @@ use cache_core::{RecordId, Tag};
 use cache_proto::{convert, v1};
 use worker::frame::CHANNELS;
 use worker::job::{Job, Known, Work};
+use worker::scenes::Scenes;
 use worker::task::Done;
 
 use crate::records;
@@ -91,7 +92,7 @@ pub fn spec(width: u32, height: u32) -> v1::FrameSpec {
 }
 
 impl Job for Pretended {
-    async fn prepare(described: &v1::DescribeResponse) -> Result<Self, String> {
+    async fn prepare(_: u64, described: &v1::DescribeResponse, _: &Scenes) -> Result<Self, String> {
         let spec = described.spec.clone().ok_or("no frame described")?;
         let v1::FrameSpec { width, height, .. } = spec;
         let gather = watch().gather.load(Ordering::Relaxed) as f32;

@@ -41,6 +41,12 @@ const REASON_MAX: usize = 1024;
 /// Most distinct names of counts in one frame.
 const COUNTS_MAX: usize = 64;
 
+/// Most machines told apart in one frame.
+const HOSTS_MAX: usize = 4096;
+
+/// Longest time one `Complete` may tell of, so that no sum can overflow.
+const SECONDS_MAX: f64 = 1e9;
+
 /// What an owner's stream does next.
 #[derive(Clone, PartialEq, Debug)]
 pub enum News {
@@ -76,18 +82,22 @@ pub struct Frame {
     fills: u32,
     leases_lost: u32,
     counts: BTreeMap<String, f64>,
+    hosts: BTreeMap<String, v1::HostUse>,
     unfit: BTreeSet<Arc<str>>,
     /// Its records are all there and are not published yet.
     publishing: bool,
     outbox: Outbox,
 }
 
-/// What the owner has still to be told. Bounded: one opening, one progress, [`DECLINES_MAX`] reasons, about
-/// [`UNDELIVERED_MAX`] bytes of tiles, one end.
+/// What the owner has still to be told. Bounded: one opening, one progress, one question for the scene,
+/// [`DECLINES_MAX`] reasons, about [`UNDELIVERED_MAX`] bytes of tiles, one end.
 #[derive(Debug, Default)]
 struct Outbox {
     opening: bool,
     progress: bool,
+    /// A worker lacks the scene.
+    scene: bool,
+    scene_asked: bool,
     declined: VecDeque<v1::FrameDeclined>,
     tiles: VecDeque<v1::FrameTile>,
     tile_bytes: usize,
@@ -107,6 +117,7 @@ impl Frame {
             fills: 0,
             leases_lost: 0,
             counts: BTreeMap::new(),
+            hosts: BTreeMap::new(),
             unfit: BTreeSet::new(),
             publishing: false,
             outbox: Outbox { opening: true, progress: true, ..Outbox::default() },
@@ -191,11 +202,14 @@ impl Frame {
         let worked = worked(request.worked_seconds)?;
         check_tiles(&self.job, expected, &request.tiles)?;
         check_counts(&self.counts, &request.counts)?;
+        let used = request.used.unwrap_or_default();
+        check_used(&used)?;
 
         round.complete(request.lease, request.gathered, worked, now);
         for count in request.counts {
             *self.counts.entry(count.name).or_default() += count.value;
         }
+        add_used(&mut self.hosts, used);
         self.outbox.progress = true;
         self.outbox.tile_bytes += request.tiles.iter().map(|tile| tile.pixels.len()).sum::<usize>();
         self.outbox.tiles.extend(request.tiles);
@@ -206,6 +220,11 @@ impl Frame {
             self.publishing |= filled;
         }
         Ok(true)
+    }
+
+    /// A worker lacks the scene: the owner is asked for it, once.
+    pub fn want_scene(&mut self) {
+        self.outbox.scene |= !std::mem::replace(&mut self.outbox.scene_asked, true);
     }
 
     /// Its records are published, or will not be: who is told that it is done may rely on that.
@@ -271,6 +290,9 @@ impl Frame {
                 base_records: base.records,
             }));
         }
+        if std::mem::take(&mut outbox.scene) {
+            return Some(Event::SceneWanted(v1::SceneWanted {}));
+        }
         if let Some(declined) = outbox.declined.pop_front() {
             return Some(Event::Declined(declined));
         }
@@ -301,6 +323,7 @@ impl Frame {
             digest: convert::digest_bytes(read.digest),
             records: read.records,
             counts: self.counts.iter().map(count).collect(),
+            hosts: self.hosts.iter().map(|(host, sum)| v1::HostUse { host: host.clone(), ..sum.clone() }).collect(),
         }))
     }
 }
@@ -316,6 +339,24 @@ fn check_gathered(gathered: u64) -> Result<(), Refusal> {
 fn worked(seconds: f64) -> Result<Duration, Refusal> {
     Duration::try_from_secs_f64(seconds)
         .map_err(|_| Refusal::field("worked_seconds", format!("is {seconds}, expected a time")))
+}
+
+fn check_used(used: &v1::HostUse) -> Result<(), Refusal> {
+    spec::size("used.host", used.host.len(), 0..=spec::NAME_MAX)?;
+    let seconds = used.round_trip_seconds;
+    if !(0.0..=SECONDS_MAX).contains(&seconds) {
+        return Err(Refusal::field("used.round_trip_seconds", format!("is {seconds}, expected 0 to {SECONDS_MAX}")));
+    }
+    Ok(())
+}
+
+fn add_used(hosts: &mut BTreeMap<String, v1::HostUse>, used: v1::HostUse) {
+    let told_apart = hosts.len() < HOSTS_MAX || hosts.contains_key(&used.host);
+    let sum = hosts.entry(if told_apart { used.host } else { String::new() }).or_default();
+    sum.sent_bytes = sum.sent_bytes.saturating_add(used.sent_bytes);
+    sum.received_bytes = sum.received_bytes.saturating_add(used.received_bytes);
+    sum.round_trips = sum.round_trips.saturating_add(used.round_trips);
+    sum.round_trip_seconds += used.round_trip_seconds;
 }
 
 fn check_tiles(job: &Job, expected: Range<u32>, tiles: &[v1::FrameTile]) -> Result<(), Refusal> {

@@ -183,6 +183,14 @@ impl Frames {
         Ok(())
     }
 
+    /// A worker lacks the scene of an open frame: its owner is asked for it.
+    pub fn want_scene(&mut self, frame: u64) {
+        if let Some(frame) = self.frames.get_mut(&frame) {
+            frame.want_scene();
+            self.changes.news = true;
+        }
+    }
+
     /// Gives back everything a worker holds, and forgets it.
     pub fn leave(&mut self, worker: &str) {
         if self.workers.remove(worker).is_none() {

@@ -12,7 +12,7 @@ use cache_proto::v1;
 use cache_proto::v1::frames_server::Frames as FramesTrait;
 use prost::Message as _;
 use tokio_stream::Stream;
-use tonic::{Request, Response, Status};
+use tonic::{Request, Response, Status, Streaming};
 
 use crate::access::{Tenant, tenant};
 use crate::bell::{Bell, Listener};
@@ -22,6 +22,7 @@ use crate::frames::{Changes, Filled, Frames};
 use crate::limits::Limits;
 use crate::refusal::{Refusal, same_version};
 use crate::replica::Mark;
+use crate::scenes::{Reading, Scenes};
 use crate::spec::{self, Job};
 use crate::store::{Store, lock};
 
@@ -41,6 +42,7 @@ const PUBLISH_AGAIN: Duration = Duration::from_millis(500);
 pub struct Board {
     frames: Mutex<Frames>,
     store: Arc<Store>,
+    scenes: Arc<Scenes>,
     clock: Clock,
     work: Bell,
     news: Bell,
@@ -52,6 +54,7 @@ impl Board {
         Self {
             frames: Mutex::new(Frames::new(limits, first)),
             store,
+            scenes: Arc::default(),
             clock,
             work: Bell::default(),
             news: Bell::default(),
@@ -67,6 +70,7 @@ impl Board {
     pub fn close(&self) {
         self.work.close();
         self.news.close();
+        self.scenes.close();
     }
 
     /// How many frames are open, and how many workers were heard of lately.
@@ -266,6 +270,40 @@ impl FramesTrait for FramesService {
         Ok(Response::new(v1::DeclineResponse {}))
     }
 
+    type SceneStream = Reading;
+
+    async fn scene(&self, request: Request<v1::SceneRequest>) -> Result<Response<Reading>, Status> {
+        let (tenant, frame) = (tenant(&request), request.get_ref().frame);
+        let board = &self.0;
+        // Within the transition, so that whoever closes the frame forgets the scene after this.
+        let wanted = board.change(|frames, _| {
+            frames.frame(&tenant, frame)?;
+            frames.want_scene(frame);
+            board.scenes.want(frame);
+            Ok::<_, Refusal>(())
+        });
+        wanted?;
+        Ok(Response::new(board.scenes.read(frame)))
+    }
+
+    async fn offer(
+        &self,
+        request: Request<Streaming<v1::OfferRequest>>,
+    ) -> Result<Response<v1::OfferResponse>, Status> {
+        let tenant = tenant(&request);
+        let mut said = request.into_inner();
+        let first = said.message().await?.ok_or(Refusal::Malformed(Malformed::Missing("part")))?;
+        lock(&self.0.frames).frame(&tenant, first.frame)?;
+        let sending = self.0.scenes.begin(first.frame)?;
+        let mut next = Some(first);
+        while let Some(request) = next {
+            sending.take(request)?;
+            next = said.message().await?;
+        }
+        sending.whole();
+        Ok(Response::new(v1::OfferResponse {}))
+    }
+
     async fn leave(&self, request: Request<v1::LeaveRequest>) -> Result<Response<v1::LeaveResponse>, Status> {
         let worker = named(&tenant(&request), &request.get_ref().worker)?;
         self.0.change(|frames, _| frames.leave(&worker));
@@ -343,6 +381,7 @@ impl Stream for Owner {
 impl Drop for Owner {
     fn drop(&mut self) {
         self.board.change(|frames, _| frames.close(self.frame));
+        self.board.scenes.forget(self.frame);
         self.board.store.release(&self.draft);
         tracing::info!(frame = self.frame, "frame closed");
     }

@@ -14,6 +14,7 @@
 //! - [`round`]: the tiles of one step: pending, leased or done; no I/O.
 //! - [`frame`]: one frame: its plan, its current round, and what its owner has still to be told; no I/O.
 //! - [`frames`]: all frames and workers: who gets which lease, and when it is lost; no I/O, time is passed in.
+//! - [`scenes`]: scenes on their way from owners of frames to workers that lack them.
 //! - [`clock`]: the only place that asks what time it is.
 //! - [`bell`]: wakes every task that waits for a change.
 //! - [`cache_service`] and [`frames_service`]: the two gRPC services, thin over the rooms above.
@@ -42,6 +43,7 @@ pub mod store;
 pub mod frame;
 pub mod frames;
 pub mod round;
+pub mod scenes;
 pub mod spec;
 
 pub mod bell;

@@ -134,7 +134,7 @@ pub fn connection_refused() {
 }
 
 /// The methods of both services, as labels: a label never comes from a peer.
-const METHODS: [&str; 11] = [
+const METHODS: [&str; 13] = [
     "Cache/Insert",
     "Cache/Subscribe",
     "Cache/Query",
@@ -146,6 +146,8 @@ const METHODS: [&str; 11] = [
     "Frames/Complete",
     "Frames/Decline",
     "Frames/Leave",
+    "Frames/Scene",
+    "Frames/Offer",
 ];
 
 /// The label of a call's path.

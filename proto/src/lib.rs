@@ -14,5 +14,8 @@ pub mod v1 {
 /// Serialised file descriptors of `ambience.v1`, for gRPC reflection.
 pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 
+/// Most bytes of a scene that is sent to workers, names of files included.
+pub const SCENE_BYTES_MAX: usize = 256 << 20;
+
 /// Version of this build; client and server must agree on it.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");

@@ -16,6 +16,7 @@ use tokio::sync::watch;
 use worker::client;
 use worker::farm::Worker;
 use worker::follow::{self, Follower};
+use worker::traffic::Traffic;
 
 use crate::disk::Disk;
 use crate::job::{MadeUp, record};
@@ -117,7 +118,7 @@ pub async fn server(farm: Rc<Farm>) -> turmoil::Result {
 /// A worker, started again by whoever looks after it when it gave up on its server.
 pub async fn worker(farm: Rc<Farm>, name: &'static str, threads: usize) -> turmoil::Result {
     loop {
-        let worker = Arc::new(Worker::<MadeUp>::new(format!("{name}.{}", farm.start()), connect()));
+        let worker = Arc::new(Worker::<MadeUp>::new(format!("{name}.{}", farm.start()), connect(), Traffic::default()));
         events::note(name, "starts");
         let lost = worker.work(threads).await;
         events::note(name, format_args!("ends: {:?}", lost.code()));

@@ -13,6 +13,7 @@ use cache_proto::{convert, v1};
 use glam::{Vec2, Vec3};
 use worker::job::{Job, Known, Work};
 use worker::levels::{Level, Levels};
+use worker::scenes::Scenes;
 use worker::task::Done;
 
 use crate::events;
@@ -161,7 +162,7 @@ fn digest(levels: &Levels) -> Digest {
 }
 
 impl Job for MadeUp {
-    async fn prepare(described: &v1::DescribeResponse) -> Result<Self, String> {
+    async fn prepare(_: u64, described: &v1::DescribeResponse, _: &Scenes) -> Result<Self, String> {
         Self::new(described.spec.clone().ok_or("nothing is described")?)
     }
 

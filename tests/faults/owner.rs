@@ -142,6 +142,8 @@ async fn attempt(farm: &Rc<Farm>, spec: &v1::FrameSpec, base: &mut Option<Base>)
         match event {
             Ok(Some(v1::FrameEvent { event: Some(event) })) => match event {
                 Event::Opened(opened) => opened_with(farm, spec, base, &opened),
+                // Its scene is made up: nobody lacks it.
+                Event::SceneWanted(_) => {}
                 Event::Tile(tile) => {
                     let place = &mut tiles[tile.tile as usize];
                     if !place.is_empty() {

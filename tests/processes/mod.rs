@@ -64,7 +64,7 @@ pub fn children(parent: u32, word: &str) -> Vec<u32> {
 }
 
 /// Hundredths of seconds of CPU a process has used.
-fn cpu_ticks(pid: u32) -> u64 {
+pub fn cpu_ticks(pid: u32) -> u64 {
     let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
     let fields: Vec<_> = stat.rsplit(") ").next().unwrap_or_default().split(' ').collect();
     fields.get(11).and_then(|t| t.parse().ok()).unwrap_or(0)

@@ -18,6 +18,7 @@ use tonic::transport::{Channel, ClientTlsConfig, Endpoint, Uri};
 use tonic::{Code, Response, Status};
 
 use crate::credentials::{Bearer, Credentials};
+use crate::traffic::Traffic;
 
 /// How long a server may be away before its clients give up.
 pub const PATIENCE: Duration = Duration::from_secs(30);
@@ -92,20 +93,32 @@ pub type Line = InterceptedService<Channel, Bearer>;
 /// # Errors
 /// When the authority's certificate cannot be used.
 pub fn connect(address: &Address, credentials: &Credentials) -> Result<Line, String> {
+    connect_counted(address, credentials, &Traffic::default())
+}
+
+/// As [`connect`]; what goes through its sockets is counted.
+///
+/// # Errors
+/// As [`connect`].
+pub fn connect_counted(address: &Address, credentials: &Credentials, traffic: &Traffic) -> Result<Line, String> {
+    let traffic = traffic.clone();
     let channel = match address.clone() {
         Address::Tcp(at) => {
             let endpoint = endpoint(&at, credentials)?;
             channel(&endpoint, move || {
-                let at = at.clone();
+                let (at, traffic) = (at.clone(), traffic.clone());
                 async move {
                     let stream = tokio::net::TcpStream::connect(at).await?;
                     stream.set_nodelay(true)?;
-                    Ok(stream)
+                    Ok(traffic.count(stream))
                 }
             })
         }
         #[cfg(unix)]
-        Address::Unix(path) => channel(&NAMELESS, move || tokio::net::UnixStream::connect(path.clone())),
+        Address::Unix(path) => channel(&NAMELESS, move || {
+            let (path, traffic) = (path.clone(), traffic.clone());
+            async move { Ok(traffic.count(tokio::net::UnixStream::connect(path).await?)) }
+        }),
         #[cfg(not(unix))]
         Address::Unix(_) => channel(&NAMELESS, || async {
             Err::<tokio::net::TcpStream, _>(io::Error::new(io::ErrorKind::Unsupported, "no Unix sockets here"))

@@ -21,7 +21,9 @@ use crate::follow;
 use crate::frame::Frame;
 use crate::job::{Dropped, Job, Work};
 use crate::ready::{Fault, Shelf};
+use crate::scenes::Scenes;
 use crate::threads::lock;
+use crate::traffic::Traffic;
 
 /// Leases live a few seconds on the server; this is several times as often.
 const RENEW: Duration = Duration::from_millis(1500);
@@ -61,8 +63,9 @@ pub struct WorkerArgs {
 /// The server is of another version, or has been away for [`client::PATIENCE`].
 pub async fn run(args: WorkerArgs, credentials: &Credentials) -> anyhow::Result<()> {
     let threads = args.threads.map_or_else(|| cores().min(THREADS_MAX as usize), usize::from);
-    let line = client::connect(&args.server, credentials).map_err(anyhow::Error::msg)?;
-    let worker = Arc::new(Worker::<Frame>::new(args.name.unwrap_or_else(unique_name), line));
+    let traffic = Traffic::default();
+    let line = client::connect_counted(&args.server, credentials, &traffic).map_err(anyhow::Error::msg)?;
+    let worker = Arc::new(Worker::<Frame>::new(args.name.unwrap_or_else(unique_name), line, traffic));
     info!(name = worker.name, %args.server, threads, "working");
     let ended = tokio::select! {
         lost = worker.clone().work(threads) => Err(lost),
@@ -147,17 +150,19 @@ pub struct Worker<J> {
     shelf: Shelf<J>,
     /// Frames declined; every thread may hold a lease of one, its owner is told once.
     declined: Mutex<BTreeSet<u64>>,
+    traffic: Traffic,
 }
 
 impl<J: Job> Worker<J> {
-    /// A worker named `name` for the server behind `line`.
-    pub fn new(name: String, line: Line) -> Self {
-        let cache = client::cache(line.clone());
+    /// A worker named `name` for the server behind `line`, whose bytes `traffic` counts.
+    pub fn new(name: String, line: Line, traffic: Traffic) -> Self {
+        let (cache, frames) = (client::cache(line.clone()), client::frames(line));
         Self {
             name,
-            shelf: Shelf::new(cache.clone()),
+            shelf: Shelf::new(cache.clone(), Scenes::new(frames.clone())),
             cache,
-            frames: client::frames(line),
+            frames,
+            traffic,
             held: Mutex::default(),
             declined: Mutex::default(),
         }
@@ -197,7 +202,7 @@ impl<J: Job> Worker<J> {
             let request = v1::RenewRequest { worker: self.name.clone(), leases: asked.iter().copied().collect() };
             let renewed = client::retry(|| {
                 let (mut frames, request) = (self.frames.clone(), request.clone());
-                async move { frames.renew(request).await }
+                async move { self.traffic.time(frames.renew(request)).await }
             });
             match renewed.await {
                 Ok(kept) => {
@@ -292,6 +297,7 @@ impl<J: Job> Worker<J> {
             counts: done.counts(&step, bytes_records, ready.take_received()),
             tiles: done.tiles,
             worked_seconds,
+            used: Some(self.traffic.take()),
         };
         let completed = client::retry(|| {
             let (mut frames, request) = (self.frames.clone(), request.clone());
@@ -306,7 +312,7 @@ impl<J: Job> Worker<J> {
     async fn describe(&self, frame: u64) -> Result<v1::DescribeResponse, Status> {
         let described = client::retry(|| {
             let mut frames = self.frames.clone();
-            async move { frames.describe(v1::DescribeRequest { frame }).await }
+            async move { self.traffic.time(frames.describe(v1::DescribeRequest { frame })).await }
         });
         described.await
     }

@@ -10,6 +10,7 @@ use cache_core::{Record, RecordId};
 use cache_proto::v1;
 
 use crate::levels::Levels;
+use crate::scenes::Scenes;
 use crate::task::Done;
 
 /// Finds a record that was gathered under the frame's draft before. The same id has the same bits, whoever made it.
@@ -20,11 +21,15 @@ pub type Dropped = Arc<dyn Fn() -> bool + Send + Sync>;
 
 /// One frame, ready to be worked on.
 pub trait Job: Sized + Send + Sync + 'static {
-    /// Makes ready what a server describes.
+    /// Makes ready what a server describes; a scene that is not on this machine comes from `scenes`.
     ///
     /// # Errors
     /// Why this worker cannot do the frame, in one line for its owner.
-    fn prepare(described: &v1::DescribeResponse) -> impl Future<Output = Result<Self, String>> + Send;
+    fn prepare(
+        frame: u64,
+        described: &v1::DescribeResponse,
+        scenes: &Scenes,
+    ) -> impl Future<Output = Result<Self, String>> + Send;
 
     /// Levels of records the frame fills; 0 for methods without records.
     fn levels(&self) -> u32;

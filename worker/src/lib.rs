@@ -25,6 +25,8 @@
 //! - [`replica`]: a copy of a namespace's log.
 //! - [`caches`]: what a step may read, sealed: a prefix of one log, lower steps of another.
 //! - [`follow`]: keeps a replica following the server, and gives back what the server lost.
+//! - [`scenes`]: scenes that others send.
+//! - [`traffic`]: what this machine uses of the network.
 //! - [`job`]: the seam between the protocol and the work.
 //! - [`task`]: the renderer's job.
 //! - [`ready`]: frames made ready.
@@ -66,9 +68,11 @@ pub mod follow;
 pub mod job;
 pub mod ready;
 pub mod replica;
+pub mod scenes;
 pub mod spec;
 pub mod task;
 pub mod threads;
+pub mod traffic;
 
 pub mod compare;
 pub mod film;

@@ -17,6 +17,7 @@ use crate::follow::Follower;
 use crate::job::{Dropped, Job, Known};
 use crate::levels::Levels;
 use crate::replica::{Part, ReplicaError};
+use crate::scenes::Scenes;
 use crate::task::CpuClock;
 use crate::threads::{lock, off_thread};
 
@@ -142,15 +143,16 @@ type Slot<J> = Arc<OnceCell<Arc<Ready<J>>>>;
 /// The frames a worker keeps ready. A log is followed as long as one of them, or a lease, reads it.
 pub struct Shelf<J> {
     cache: Cache,
+    scenes: Scenes,
     /// Last used last.
     frames: Mutex<Vec<(u64, Slot<J>)>>,
     logs: Mutex<BTreeMap<Namespace, Weak<Follower>>>,
 }
 
 impl<J: Job> Shelf<J> {
-    /// An empty one, for frames of the server that `cache` is connected to.
-    pub fn new(cache: Cache) -> Self {
-        Self { cache, frames: Mutex::default(), logs: Mutex::default() }
+    /// An empty one, for frames of the server that both are connected to.
+    pub fn new(cache: Cache, scenes: Scenes) -> Self {
+        Self { cache, scenes, frames: Mutex::default(), logs: Mutex::default() }
     }
 
     /// A frame made ready, once, whoever asks first.
@@ -173,13 +175,13 @@ impl<J: Job> Shelf<J> {
             }
             slot
         };
-        slot.get_or_try_init(async || self.prepare(describe().await?).await).await.cloned()
+        slot.get_or_try_init(async || self.prepare(id, describe().await?).await).await.cloned()
     }
 
-    async fn prepare(&self, described: v1::DescribeResponse) -> Result<Arc<Ready<J>>, Fault> {
+    async fn prepare(&self, frame: u64, described: v1::DescribeResponse) -> Result<Arc<Ready<J>>, Fault> {
         let unfit = |e: convert::Malformed| Fault::Unfit(e.to_string());
         let draft = convert::namespace(&described.draft).map_err(unfit)?;
-        let job = J::prepare(&described).await.map_err(Fault::Unfit)?;
+        let job = J::prepare(frame, &described, &self.scenes).await.map_err(Fault::Unfit)?;
         if job.levels() == 0 {
             return Ok(Arc::new(Ready { job: Arc::new(job), draft, records: None }));
         }

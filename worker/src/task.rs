@@ -2,13 +2,15 @@
 
 use std::sync::Arc;
 
-use anyhow::Context as _;
 use cache_core::rounds::Step;
 use cache_core::{Record, Tag};
 use cache_proto::{convert, v1};
 
 use crate::frame::{Counts, Frame, Sums};
 use crate::job::{Job, Work};
+use crate::scene::{Files, Scene};
+use crate::scenes::Scenes;
+use crate::settings::Settings;
 use crate::threads::off_thread;
 use crate::{scene, spec};
 
@@ -26,9 +28,21 @@ pub struct Done {
 }
 
 impl Job for Frame {
-    async fn prepare(described: &v1::DescribeResponse) -> Result<Self, String> {
+    async fn prepare(frame: u64, described: &v1::DescribeResponse, scenes: &Scenes) -> Result<Self, String> {
         let spec = described.spec.clone().ok_or("the server described nothing")?;
-        off_thread(move || load(&spec)).await?.map_err(|e| format!("{e:#}"))
+        let settings = spec::settings(&spec)?;
+        let load = async |files: Files| {
+            let spec = spec.clone();
+            off_thread(move || load(&spec, &files)).await?
+        };
+        let scene = match load(Files::default()).await {
+            Ok(scene) => scene,
+            Err(why) => match scenes.of(frame, &spec.scene_hash).await {
+                Ok(files) => load(files).await?,
+                Err(status) => return Err(format!("{why}; and nobody sent it: {}", status.message())),
+            },
+        };
+        off_thread(move || ready(&spec, scene, settings)).await?.map_err(|e| format!("{e:#}"))
     }
 
     fn levels(&self) -> u32 {
@@ -44,15 +58,18 @@ impl Job for Frame {
     }
 }
 
-/// Loads what a message describes, and makes sure that it is what its owner meant.
-fn load(described: &v1::FrameSpec) -> anyhow::Result<Frame> {
-    let settings = spec::settings(described).map_err(anyhow::Error::msg)?;
-    let scene = scene::load(described.scene.as_ref()).context("cannot load the scene")?;
-    anyhow::ensure!(
-        scene.hash[..] == described.scene_hash[..],
-        "{} has other content here than where the frame was opened",
-        described.scene
-    );
+/// Loads the scene a message describes, and makes sure that it is what its owner meant.
+fn load(described: &v1::FrameSpec, files: &Files) -> Result<Scene, String> {
+    let scene = scene::load_from(described.scene.as_ref(), files);
+    let scene = scene.map_err(|e| format!("cannot load the scene: {e}"))?;
+    if scene.hash[..] != described.scene_hash[..] {
+        return Err(format!("{} has other content here than where the frame was opened", described.scene));
+    }
+    Ok(scene)
+}
+
+/// Makes a frame, and makes sure that it is what its owner meant.
+fn ready(described: &v1::FrameSpec, scene: Scene, settings: Settings) -> anyhow::Result<Frame> {
     let frame = Frame::new(scene, settings);
     anyhow::ensure!(
         frame.namespace().0[..] == described.namespace[..],
@@ -186,7 +203,6 @@ mod tests {
     use cache_core::RecordId;
 
     use super::*;
-    use crate::settings::Settings;
 
     #[test]
     fn known_records_are_not_gathered_again_and_change_nothing() {

@@ -15,7 +15,9 @@ use worker::client;
 use worker::farm::Worker;
 use worker::follow::Follower;
 use worker::job::{Job, Work};
+use worker::scenes::Scenes;
 use worker::task::Done;
+use worker::traffic::Traffic;
 
 const SCENE: Namespace = Namespace([1; 32]);
 const DRAFT: Namespace = Namespace([2; 32]);
@@ -47,7 +49,7 @@ fn digest(ids: &[u128]) -> Digest {
 struct Tiles;
 
 impl Job for Tiles {
-    async fn prepare(_: &v1::DescribeResponse) -> Result<Self, String> {
+    async fn prepare(_: u64, _: &v1::DescribeResponse, _: &Scenes) -> Result<Self, String> {
         Ok(Self)
     }
 
@@ -107,7 +109,7 @@ async fn completed(script: &Script, lease: u64) -> (u64, u64) {
 }
 
 fn at_work(channel: worker::client::Line) -> tokio::task::JoinHandle<Status> {
-    tokio::spawn(Arc::new(Worker::<Tiles>::new("worker".into(), channel)).work(1))
+    tokio::spawn(Arc::new(Worker::<Tiles>::new("worker".into(), channel, Traffic::default())).work(1))
 }
 
 /// A follower that has read a log of these.

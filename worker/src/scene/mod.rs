@@ -3,17 +3,20 @@
 //! Conventions: right-handed; linear RGB; lengths are the scene's own; emitted radiance in W/(sr m2) per channel,
 //! from the front face only (counter-clockwise); irradiance of distant light in W/m2 on a facing surface.
 
-use std::path::Path;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
 use glam::{Vec2, Vec3};
 
 pub mod camera;
+mod files;
 mod gltf;
 mod rad;
 mod texture;
 mod view;
 
 pub use camera::Camera;
+pub use files::Files;
 
 /// Linear RGB.
 pub type Rgb = Vec3;
@@ -214,10 +217,28 @@ pub struct SceneError(pub String);
 /// # Errors
 /// A missing or damaged file, anything not supported, and geometry that cannot be rendered (NaN).
 pub fn load(path: &Path) -> Result<Scene, SceneError> {
+    load_from(path, &Files::default())
+}
+
+/// All files that [`load`] reads, by the paths it asks for: with them it makes the same scene elsewhere.
+///
+/// # Errors
+/// As [`load`].
+pub fn files(path: &Path) -> Result<BTreeMap<PathBuf, Vec<u8>>, SceneError> {
+    let files = Files::kept();
+    load_from(path, &files)?;
+    Ok(files.into_kept())
+}
+
+/// As [`load`], from `files`.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_from(path: &Path, files: &Files) -> Result<Scene, SceneError> {
     let ending = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
     let mut scene = match ending.as_str() {
-        "glb" | "gltf" => gltf::load(path)?,
-        "rad" => rad::load(path)?,
+        "glb" | "gltf" => gltf::load(path, files)?,
+        "rad" => rad::load(path, files)?,
         _ => {
             return Err(SceneError(format!(
                 "{}: unknown kind of scene; expected a name ending in .glb, .gltf or .rad",

@@ -256,6 +256,16 @@ impl v1::frames_server::Frames for Script {
         Ok(Response::new(v1::DeclineResponse {}))
     }
 
+    type SceneStream = Events<v1::ScenePart>;
+
+    async fn scene(&self, _: Request<v1::SceneRequest>) -> Result<Response<Self::SceneStream>, Status> {
+        Ok(Response::new(Box::pin(tokio_stream::empty().map(Ok))))
+    }
+
+    async fn offer(&self, _: Request<Streaming<v1::OfferRequest>>) -> Result<Response<v1::OfferResponse>, Status> {
+        Ok(Response::new(v1::OfferResponse {}))
+    }
+
     async fn leave(&self, _: Request<v1::LeaveRequest>) -> Result<Response<v1::LeaveResponse>, Status> {
         Ok(Response::new(v1::LeaveResponse {}))
     }

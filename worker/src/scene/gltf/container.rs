@@ -2,12 +2,11 @@
 //! `get`: the crate's own wrappers panic on documents that its validation lets through, and its validation panics on
 //! some that it should refuse.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use ::gltf::json::{self, Index, Root, buffer};
 
-use super::Fault;
+use super::{Fault, Files};
 
 /// Extensions that are read, so that a file may require them.
 const SUPPORTED: [&str; 5] = [
@@ -24,17 +23,19 @@ pub(super) struct Document {
     pub(super) root: Root,
     buffers: Vec<Vec<u8>>,
     folder: PathBuf,
+    files: Files,
 }
 
 impl Document {
     /// Reads `path`, .glb or .gltf by its content, and all of its buffers.
-    pub(super) fn open(path: &Path) -> Result<Self, Fault> {
-        let bytes = read_file(path).map_err(|e| format!("cannot be read: {e}"))?;
+    pub(super) fn open(path: &Path, files: &Files) -> Result<Self, Fault> {
+        let bytes = files.read(path).map_err(|e| format!("cannot be read: {e}"))?;
         let (text, blob) = if bytes.starts_with(b"glTF") { split_glb(&bytes)? } else { (&bytes[..], None) };
         let root = parse(text)?;
         check_version(&root)?;
         check_required(&root)?;
-        let mut document = Self { root, buffers: Vec::new(), folder: path.parent().unwrap_or(path).to_path_buf() };
+        let folder = path.parent().unwrap_or(path).to_path_buf();
+        let mut document = Self { root, buffers: Vec::new(), folder, files: files.clone() };
         for (index, buffer) in document.root.buffers.iter().enumerate() {
             let data = document.buffer_bytes(buffer, if index == 0 { blob } else { None });
             let data = data.map_err(|fault| format!("buffer {index}: {fault}"))?;
@@ -77,7 +78,7 @@ impl Document {
             return Err(format!("uri {uri:?} is not supported; expected a relative file name or a data URI"));
         }
         let name = percent_decode(uri).ok_or_else(|| format!("uri {uri:?} is not a percent-encoded UTF-8 name"))?;
-        read_file(&self.folder.join(&name)).map_err(|e| format!("file {name:?} cannot be read: {e}"))
+        self.files.read(&self.folder.join(&name)).map_err(|e| format!("file {name:?} cannot be read: {e}"))
     }
 
     fn buffer_bytes(&self, buffer: &json::Buffer, blob: Option<&[u8]>) -> Result<Vec<u8>, Fault> {
@@ -107,15 +108,6 @@ pub(super) fn beyond(count: usize) -> String {
 pub(super) fn slice(bytes: &[u8], start: u64, length: u64) -> Option<&[u8]> {
     let end = usize::try_from(start.checked_add(length)?).ok()?;
     bytes.get(usize::try_from(start).ok()?..end)
-}
-
-/// Only regular files: a scene must not make us wait for a pipe or read a device without end.
-fn read_file(path: &Path) -> Result<Vec<u8>, String> {
-    let metadata = fs::metadata(path).map_err(|e| e.to_string())?;
-    if !metadata.is_file() {
-        return Err("not a regular file".into());
-    }
-    fs::read(path).map_err(|e| e.to_string())
 }
 
 /// JSON and binary chunk of a .glb.

@@ -20,7 +20,7 @@ use std::path::Path;
 use ::gltf::json::scene::{Node, Scene as Tree};
 use ::gltf::json::{Index, Root};
 
-use super::{Scene, SceneError};
+use super::{Files, Scene, SceneError};
 use container::{Document, beyond};
 use material::Materials;
 use placement::Placement;
@@ -33,14 +33,14 @@ type Fault = String;
 const LONGEST_LINE: usize = 2000;
 
 /// Reads the default scene (the first where the file names none). The hash is left to the caller.
-pub(super) fn load(path: &Path) -> Result<Scene, SceneError> {
+pub(super) fn load(path: &Path, files: &Files) -> Result<Scene, SceneError> {
     let name = path.display();
     // One line of bearable length, whatever a file has in its names and URIs.
     let line = |text: Fault| -> String {
         let text = format!("{name}: {text}").replace(|c: char| c.is_control(), " ");
         text.chars().take(LONGEST_LINE).collect()
     };
-    let document = Document::open(path).map_err(|fault| SceneError(line(fault)))?;
+    let document = Document::open(path, files).map_err(|fault| SceneError(line(fault)))?;
     let mut scene = read(&document).map_err(|fault| SceneError(line(fault)))?;
     scene.warnings = scene.warnings.into_iter().map(line).collect();
     Ok(scene)

@@ -21,7 +21,7 @@ pub(super) use lexer::show;
 use lexer::{Item, Lexer};
 use xform::{Frame, Xform};
 
-use super::{Scene, SceneError};
+use super::{Files, Scene, SceneError};
 
 /// Deepest nesting of files.
 const MAX_DEPTH: usize = 32;
@@ -34,9 +34,10 @@ const MAX_WARNINGS: usize = 100;
 ///
 /// # Errors
 /// One line `FILE:LINE: TYPE NAME: what is wrong; what would be right`.
-pub(super) fn load(path: &Path) -> Result<Scene, SceneError> {
-    let source = Source::read(path).map_err(SceneError)?;
-    let mut reader = Reader { home: source.directory().to_path_buf(), ..Reader::default() };
+pub(super) fn load(path: &Path, files: &Files) -> Result<Scene, SceneError> {
+    let source = Source::read(path, files).map_err(SceneError)?;
+    let home = source.directory().to_path_buf();
+    let mut reader = Reader { home, files: files.clone(), ..Reader::default() };
     reader.file(&source, &Frame::default())?;
     if reader.scene.triangles.is_empty() && reader.scene.distant.is_empty() {
         return Err(SceneError(format!("{}: nothing to render; expected at least one surface", source.shown)));
@@ -55,14 +56,9 @@ struct Source {
 }
 
 impl Source {
-    fn read(path: &Path) -> Result<Source, String> {
+    fn read(path: &Path, files: &Files) -> Result<Source, String> {
         let shown = path.display().to_string();
-        // A device may never end.
-        match std::fs::metadata(path) {
-            Ok(about) if !about.is_file() => return Err(format!("{shown}: not a file; expected a Radiance scene")),
-            _ => {}
-        }
-        let bytes = std::fs::read(path).map_err(|e| format!("{shown}: cannot be read: {e}"))?;
+        let bytes = files.read(path).map_err(|e| format!("{shown}: cannot be read: {e}"))?;
         Ok(Source { path: path.to_path_buf(), shown, bytes })
     }
 
@@ -140,6 +136,7 @@ impl<'a> Statement<'a> {
 struct Reader {
     scene: Scene,
     library: material::Library,
+    files: Files,
     /// Directory of the outermost file.
     home: PathBuf,
     /// The files being read, outermost first.
@@ -234,7 +231,7 @@ impl Reader {
         let places = [outer.directory().join(name), self.home.join(name), PathBuf::from(name)];
         let path = places
             .iter()
-            .find(|p| p.is_file())
+            .find(|p| self.files.has(p))
             .ok_or_else(|| format!("file `{shown}` is not found; expected it in {}", outer.directory().display()))?;
         if self.open.contains(&identity(path)) {
             return Err(format!("file `{shown}` includes itself; expected no circle"));
@@ -242,7 +239,7 @@ impl Reader {
         if self.open.len() >= MAX_DEPTH {
             return Err(format!("files are nested deeper than {MAX_DEPTH}; expected fewer levels"));
         }
-        Source::read(path)
+        Source::read(path, &self.files)
     }
 
     fn warn(&mut self, warning: String) {

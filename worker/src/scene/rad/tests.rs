@@ -7,8 +7,7 @@ use glam::{DVec3, Vec3};
 use proptest::prelude::*;
 use tempfile::TempDir;
 
-use super::load;
-use crate::scene::{Scene, Surface, Triangle};
+use crate::scene::{Scene, Surface, Triangle, load};
 
 const GREY: &str = "void plastic grey\n0\n0\n5 .5 .5 .5 0 0\n";
 

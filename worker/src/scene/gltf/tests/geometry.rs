@@ -5,9 +5,8 @@ use std::fs;
 use glam::{Vec2, Vec3};
 use serde_json::json;
 
-use super::super::load;
 use super::{CORNERS, File};
-use crate::scene::{Scene, Triangle};
+use crate::scene::{Scene, Triangle, load};
 
 fn geometric_normal(triangle: &Triangle) -> Vec3 {
     let [a, b, c] = triangle.positions;

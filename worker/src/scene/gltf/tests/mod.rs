@@ -10,8 +10,7 @@ use std::fs;
 use ::gltf::json::{Value, serialize};
 use serde_json::json;
 
-use super::load;
-use crate::scene::{Scene, SceneError};
+use crate::scene::{Scene, SceneError, load};
 
 /// Corners of the triangle of [`File::triangle`]. Its front faces +Z.
 const CORNERS: [f32; 9] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0];
