@@ -11,6 +11,7 @@ use worker::{film, pilot, spec};
 
 use crate::children::Transport;
 use crate::failure::Failure;
+use crate::progress::Told;
 
 /// Renders a picture.
 #[derive(Clone, Debug, clap::Args)]
@@ -63,6 +64,9 @@ pub struct RenderArgs {
     /// Write statistics as one JSON object
     #[arg(long, value_name = "OUT.json")]
     pub stats: Option<PathBuf>,
+    /// How progress is told
+    #[arg(long, value_name = "HOW", value_enum, default_value_t)]
+    pub progress: Told,
     /// No progress and no closing line; warnings and errors only
     #[arg(long)]
     pub quiet: bool,

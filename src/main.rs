@@ -2,6 +2,7 @@
 //!
 //! - [`args`], [`render`], [`children`], [`familiar`], [`progress`], [`stats`]: `render`.
 //! - [`compare`]: `compare`. [`cache`]: `cache`. `serve` and `worker` run the libraries `cache-server` and `worker`.
+//! - [`relay`]: `serve --upstream`.
 //! - [`parent`]: children end with their parent. [`failure`]: exit codes. [`say`]: stdout and stderr.
 
 use std::process::ExitCode;
@@ -18,6 +19,7 @@ mod failure;
 mod familiar;
 mod parent;
 mod progress;
+mod relay;
 mod render;
 mod say;
 mod stats;
@@ -52,6 +54,8 @@ enum Command {
     Serve {
         #[command(flatten)]
         serve: cache_server::ServeArgs,
+        #[command(flatten)]
+        relay: relay::RelayArgs,
         #[command(flatten)]
         owned: parent::OwnedArgs,
     },
@@ -93,10 +97,15 @@ fn main() -> ExitCode {
     };
     end(match cli.command {
         Command::Render(args) => block_on(render::run(args)),
-        Command::Serve { serve, owned } => {
+        Command::Serve { serve, relay, owned } => {
             owned.watch();
             cache_server::cli::log_to_stderr(serve.log_format);
-            block_on(async { cache_server::run(serve).await.map_err(serve_failure) })
+            block_on(async {
+                match relay.upstream.clone() {
+                    Some(upstream) => relay::run(serve, relay, upstream).await,
+                    None => cache_server::run(serve).await.map_err(serve_failure),
+                }
+            })
         }
         Command::Worker { worker, owned } => {
             owned.watch();

@@ -18,10 +18,22 @@ const TIME_MIN: Duration = Duration::from_secs(1);
 /// Steps of the bar.
 const BAR: u64 = 1000;
 
+/// How progress is told.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default, clap::ValueEnum)]
+pub enum Told {
+    /// A bar in a terminal, a line every few seconds elsewhere, on stderr
+    #[default]
+    Auto,
+    /// Lines openjd_progress and openjd_status on stdout, as Open Job Description has them
+    Openjd,
+}
+
 enum Shown {
     Bar(ProgressBar),
     /// When the last line was.
     Lines(Instant),
+    /// Whole percents told so far.
+    OpenJd(u32),
     Nothing,
 }
 
@@ -36,8 +48,10 @@ pub struct Progress {
 
 impl Progress {
     /// A bar if stderr is a terminal, else lines; nothing if `quiet`. With `own` workers nobody need be told to start some.
-    pub fn new(quiet: bool, own: bool) -> Self {
-        let shown = if quiet {
+    pub fn new(told: Told, quiet: bool, own: bool) -> Self {
+        let shown = if told == Told::Openjd {
+            Shown::OpenJd(0)
+        } else if quiet {
             Shown::Nothing
         } else if console_is_terminal() {
             let bar = ProgressBar::new(BAR);
@@ -55,8 +69,8 @@ impl Progress {
         self.show(phase, phase.to_string(), None);
     }
 
-    /// Shows what the server said of a picture of so many pixels.
-    pub fn frame(&mut self, progress: &v1::FrameProgress, pixels: u64) {
+    /// Shows what the server said of a picture of so many pixels and levels.
+    pub fn frame(&mut self, progress: &v1::FrameProgress, pixels: u64, levels: u32) {
         let Some(step) = &progress.step else { return };
         let phase = phase_name(step);
         if progress.workers == 0 && !self.own {
@@ -66,7 +80,15 @@ impl Progress {
             0 => format!("pixels · {} records", progress.records),
             level => format!("level {level} pass {} · {} records", step.pass + 1, progress.records),
         };
-        self.show(&format!("{phase} {}", step.pass), shown, Some(share(progress, pixels)));
+        let share = share(progress, pixels);
+        if let Shown::OpenJd(told) = &mut self.shown {
+            let percent = (100.0 * whole(step, share, levels)) as u32;
+            if percent > *told {
+                *told = percent;
+                drop(say::result(format_args!("openjd_progress: {percent}")));
+            }
+        }
+        self.show(&format!("{phase} {}", step.pass), shown, Some(share));
     }
 
     /// Shows what others have to do first; as a line that stays where there is no bar.
@@ -85,6 +107,7 @@ impl Progress {
         }
         let left = share.and_then(|share| remaining(now - self.since, share));
         match &mut self.shown {
+            Shown::OpenJd(_) if new => drop(say::result(format_args!("openjd_status: {text}"))),
             Shown::Bar(bar) => {
                 bar.set_position((share.unwrap_or(0.0) * BAR as f64) as u64);
                 bar.set_prefix(left.map_or(String::new(), |l| format!(", {} left in this phase", HumanDuration(l))));
@@ -152,6 +175,13 @@ fn share(progress: &v1::FrameProgress, pixels: u64) -> f64 {
     }
 }
 
+/// How much of the whole is done, each level and the pixels taken as equal parts; later passes of a level are not counted.
+fn whole(step: &v1::Step, share: f64, levels: u32) -> f64 {
+    let before = levels.saturating_sub(step.level);
+    let here = if step.pass > 0 && step.level > 0 { 1.0 } else { share };
+    (f64::from(before) + here) / f64::from(levels + 1)
+}
+
 /// Time left if the rest goes as the part before; `None` when too little of it is done to tell.
 fn remaining(elapsed: Duration, share: f64) -> Option<Duration> {
     let known = (SHARE_MIN..=1.0).contains(&share) && elapsed >= TIME_MIN;
@@ -175,6 +205,15 @@ mod tests {
         assert_eq!(share(&v1::FrameProgress { step: Some(large), ..progress.clone() }, 512 * 512), 0.3125);
         let pixels = v1::FrameProgress { step: Some(v1::Step::default()), ..progress };
         assert_eq!(share(&pixels, 1), 0.25);
+    }
+
+    #[test]
+    fn the_whole_only_grows() {
+        let step = |level, pass| v1::Step { level, pass, ..Default::default() };
+        let shown = [(step(2, 0), 0.5), (step(2, 1), 0.1), (step(1, 0), 0.0), (step(1, 2), 0.9), (step(0, 0), 1.0)];
+        let shown = shown.map(|(step, share)| (600.0 * whole(&step, share, 2)).round());
+        assert_eq!(shown, [100.0, 200.0, 200.0, 400.0, 600.0]);
+        assert_eq!(whole(&step(0, 0), 0.5, 0), 0.5);
     }
 
     #[test]

@@ -86,7 +86,7 @@ async fn signalled() -> u8 {
 }
 
 async fn render(args: &RenderArgs, credentials: Credentials, children: &mut Children) -> Result<(), Failure> {
-    let (mut stats, mut progress) = (Stats::default(), Progress::new(args.quiet, args.workers() > 0));
+    let (mut stats, mut progress) = (Stats::default(), Progress::new(args.progress, args.quiet, args.workers() > 0));
     stats.phase("load");
     progress.phase("loading the scene");
     let frame = {
@@ -264,7 +264,7 @@ impl Render<'_> {
             match event {
                 Some(FrameEvent::Progress(progress)) => {
                     self.stats.phase(&progress.step.as_ref().map_or("start".into(), phase_name));
-                    self.progress.frame(&progress, job.settings.size());
+                    self.progress.frame(&progress, job.settings.size(), job.spec.levels);
                 }
                 Some(FrameEvent::Tile(tile)) => {
                     self.stats.tile_bytes += tile.pixels.len() as u64;

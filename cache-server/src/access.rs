@@ -8,6 +8,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use subtle::{ConditionallySelectable as _, ConstantTimeEq as _};
+use tonic::codegen::http::HeaderValue;
 
 use crate::refusal::Refusal;
 
@@ -47,6 +48,10 @@ impl fmt::Display for Tenant {
         f.write_str(&self.0)
     }
 }
+
+/// The header a call was let in with, for those who pass it on.
+#[derive(Clone)]
+pub struct Shown(pub Option<HeaderValue>);
 
 /// On whose behalf a request is made.
 pub fn tenant<T>(request: &tonic::Request<T>) -> Tenant {

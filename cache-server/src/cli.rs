@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use tokio::signal::unix::{SignalKind, signal};
+use tonic::service::Routes;
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::LevelFilter;
 
@@ -72,6 +73,14 @@ pub enum LogFormat {
 /// # Errors
 /// What keeps it from running, in one line; [`ServeError::exit_code`] says how to exit.
 pub async fn run(args: ServeArgs) -> Result<(), ServeError> {
+    run_as(args, None).await
+}
+
+/// As [`run`]; what others answer `instead` of its own store and frames, they answer behind the same door.
+///
+/// # Errors
+/// As [`run`].
+pub async fn run_as(args: ServeArgs, instead: Option<Routes>) -> Result<(), ServeError> {
     if args.check {
         return args.check().map_err(|error| ServeError::Usage(error.to_string()));
     }
@@ -79,7 +88,7 @@ pub async fn run(args: ServeArgs) -> Result<(), ServeError> {
     // Before binding, so that a signal at any time after removes the sockets' files.
     let mut interrupt = signal(SignalKind::interrupt()).map_err(failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(failed)?;
-    let mut config = args.config()?;
+    let mut config = Config { instead, ..args.config()? };
     if let Some(address) = args.metrics {
         metrics::publish(args.allowed(address, "--metrics")?)?;
     }

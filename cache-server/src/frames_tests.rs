@@ -174,6 +174,7 @@ impl Farm {
             tiles: if step.level == 0 { tiles.clone().map(pixels).collect() } else { vec![] },
             counts: vec![v1::Count { name: "rays".into(), value: tiles.len() as f64 }],
             worked_seconds: 0.0,
+            used: None,
         };
         let position = self.log.get();
         let mark = |_: &Namespace, _| Mark { position, ..Mark::default() };
@@ -408,6 +409,7 @@ fn what_a_worker_says_wrong_is_named_and_its_lease_stays() {
         tiles: (work.tile_from..work.tile_to).map(|tile| v1::FrameTile { tile, pixels: vec![0; 48].into() }).collect(),
         counts: vec![v1::Count { name: name.into(), value }],
         worked_seconds: 0.0,
+        used: None,
     };
     let mut say = |request| frames.complete(request, Duration::ZERO, |_, _| Mark::default());
     named(say(saying(u64::MAX, "rays", 1.0)), "gathered");
@@ -416,8 +418,36 @@ fn what_a_worker_says_wrong_is_named_and_its_lease_stays() {
     for worked_seconds in [-1.0, f64::NAN, 1e300] {
         named(say(v1::CompleteRequest { worked_seconds, ..saying(0, "rays", 1.0) }), "worked_seconds");
     }
+    let using = |host: &str, round_trip_seconds| {
+        let used = Some(v1::HostUse { host: host.into(), round_trip_seconds, ..Default::default() });
+        v1::CompleteRequest { used, ..saying(0, "rays", 1.0) }
+    };
+    named(say(using(&"x".repeat(65), 0.0)), "used.host");
+    for seconds in [-1.0, f64::NAN, f64::MAX] {
+        named(say(using("x", seconds)), "used.round_trip_seconds");
+    }
     assert!(!say(v1::CompleteRequest { worker: "b".into(), ..saying(0, "rays", 1.0) }).expect("not b's"));
     assert!(say(saying(0, "rays", 1.0)).expect("sound"));
+}
+
+#[test]
+fn an_owner_is_asked_for_the_scene_once() {
+    let mut frames = Frames::new(Limits::default(), 1);
+    let frame = open(&mut frames, 4, 0);
+    let mut asked = |frames: &mut Frames| {
+        let mut asked = 0;
+        while let News::Tell(event) = frames.news(frame, |_, _| Mark::default()) {
+            asked += usize::from(matches!(event.event, Some(v1::frame_event::Event::SceneWanted(_))));
+        }
+        asked
+    };
+    assert_eq!(asked(&mut frames), 0);
+    frames.want_scene(frame);
+    frames.want_scene(frame);
+    assert!(frames.take_changes().news);
+    assert_eq!(asked(&mut frames), 1);
+    frames.want_scene(frame);
+    assert_eq!(asked(&mut frames), 0);
 }
 
 #[test]

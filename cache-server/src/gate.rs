@@ -13,7 +13,7 @@ use tonic::codegen::{BoxFuture, Service};
 use tower::Layer;
 use tracing::Instrument as _;
 
-use crate::access::{Tenant, Tokens};
+use crate::access::{Shown, Tenant, Tokens};
 use crate::door::Pass;
 use crate::inflow::{Holding, Inflow};
 use crate::metrics;
@@ -51,6 +51,7 @@ impl Gate {
             let tenant = self.tokens.check(authorization.as_ref().map(HeaderValue::as_bytes))?;
             tracing::Span::current().record("tenant", tenant.name());
             request.extensions_mut().insert::<Tenant>(tenant);
+            request.extensions_mut().insert(Shown(authorization));
             if let Some(pass) = pass {
                 pass.stay();
             }

@@ -66,7 +66,7 @@ pub mod tls;
 pub mod cli;
 pub mod files;
 
-pub use cli::{ServeArgs, run};
+pub use cli::{ServeArgs, run, run_as};
 pub use limits::Limits;
 pub use listen::{Bound, Listen, ServeError, bind};
 pub use serve::{Config, Node, serve, serve_on};

@@ -15,6 +15,7 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tokio_stream::Stream;
 use tokio_stream::wrappers::UnixListenerStream;
+use tonic::service::Routes;
 use tonic::transport::Server;
 use tonic::transport::server::{Connected, TcpIncoming};
 
@@ -73,6 +74,8 @@ pub struct Config {
     pub tokens: Tokens,
     /// How TCP connections are encrypted, if they are.
     pub tls: Option<Tls>,
+    /// Who answers in place of this server's own store and frames: a relay.
+    pub instead: Option<Routes>,
 }
 
 impl Default for Config {
@@ -86,6 +89,7 @@ impl Default for Config {
             first_number: (random << 20) + 1,
             tokens: Tokens::default(),
             tls: None,
+            instead: None,
         }
     }
 }
@@ -99,6 +103,7 @@ pub struct Node {
     gate: Gate,
     health: Arc<Health>,
     tls: Option<Tls>,
+    instead: Option<Routes>,
     calls: u32,
 }
 
@@ -108,7 +113,7 @@ impl Node {
     /// # Errors
     /// When the journal cannot be read.
     pub fn new(config: Config) -> io::Result<Self> {
-        let Config { limits, journal, first_number, tokens, tls } = config;
+        let Config { limits, journal, first_number, tokens, tls, instead } = config;
         let (store, writer) = Store::open(limits, journal)?;
         tokio::spawn(writer.run());
         let store = Arc::new(store);
@@ -116,7 +121,7 @@ impl Node {
         let (door, gate) = (Arc::new(Door::new(limits.connections)), Gate::new(tokens, limits.inflow));
         // The range of the limit is far smaller than a u32.
         let calls = u32::try_from(limits.calls).unwrap_or(u32::MAX);
-        Ok(Self { store, board, door, gate, health: Arc::default(), tls, calls })
+        Ok(Self { store, board, door, gate, health: Arc::default(), tls, instead, calls })
     }
 
     /// Takes back lost leases, and tells how things stand, for ever.
@@ -170,8 +175,12 @@ where
     I: Stream<Item = io::Result<IO>>,
     IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
 {
-    let cache = CacheServer::new(CacheService::new(node.store.clone(), node.board.clone()));
-    let frames = FramesServer::new(FramesService::new(node.board));
+    let services = node.instead.clone().unwrap_or_else(|| {
+        let cache = CacheServer::new(CacheService::new(node.store.clone(), node.board.clone()));
+        let frames = FramesServer::new(FramesService::new(node.board.clone()));
+        Routes::new(cache.max_decoding_message_size(CACHE_MESSAGE_MAX))
+            .add_service(frames.max_decoding_message_size(FRAMES_MESSAGE_MAX))
+    });
     node.health.tell(node.store.works()).await;
     let reflection = tonic_reflection::server::Builder::configure()
         .register_encoded_file_descriptor_set(cache_proto::DESCRIPTORS)
@@ -191,8 +200,7 @@ where
         .http2_max_pending_accept_reset_streams(Some(RESETS_MAX))
         .http2_max_local_error_reset_streams(Some(RESETS_MAX))
         .layer(node.gate)
-        .add_service(cache.max_decoding_message_size(CACHE_MESSAGE_MAX))
-        .add_service(frames.max_decoding_message_size(FRAMES_MESSAGE_MAX))
+        .add_routes(services)
         .add_service(node.health.service())
         .add_service(reflection)
         .serve_with_incoming_shutdown(node.door.guests(incoming), shutdown)

@@ -361,6 +361,7 @@ async fn work(server: &Server, name: &str) -> Infallible {
             tiles: if step.level == 0 { tiles.map(pixels).collect() } else { vec![] },
             counts: vec![v1::Count { name: "leases".into(), value: 1.0 }],
             worked_seconds: 0.0,
+            used: Some(v1::HostUse { host: name.into(), sent_bytes: 7, ..Default::default() }),
         };
         soon(frames.complete(request)).await.expect("sound");
     }
@@ -384,6 +385,7 @@ async fn a_frame_is_filled_by_two_workers_and_told_to_its_owner() {
                 Event::Tile(tile) => tiles.push(tile.tile),
                 Event::Done(done) => return done,
                 Event::Declined(declined) => panic!("{declined:?}"),
+                Event::SceneWanted(_) => panic!("nobody lacks the scene"),
             }
         }
         panic!("ended without an end");

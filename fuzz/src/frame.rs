@@ -164,6 +164,7 @@ impl Board {
             tiles,
             counts,
             worked_seconds: f64::from(byte(bytes, 4)) / 64.0,
+            used: None,
         });
     }
 

@@ -190,6 +190,7 @@ fn opened() -> Vec<Vec<u8>> {
         tiles,
         counts: vec![v1::Count { name: "queries".into(), value: 3.0 }],
         worked_seconds: 0.25,
+        used: None,
     };
     let claims = [
         v1::CompleteRequest { gathered: u64::MAX, ..complete.clone() },

@@ -101,8 +101,21 @@ pub fn connect(address: &Address, credentials: &Credentials) -> Result<Line, Str
 /// # Errors
 /// As [`connect`].
 pub fn connect_counted(address: &Address, credentials: &Credentials, traffic: &Traffic) -> Result<Line, String> {
+    Ok(over(dial(address, credentials, traffic)?, credentials.bearer()))
+}
+
+/// A line over a connection that others use too.
+pub fn over(channel: Channel, bearer: Bearer) -> Line {
+    InterceptedService::new(channel, bearer)
+}
+
+/// The connection alone, without the token.
+///
+/// # Errors
+/// As [`connect`].
+pub fn dial(address: &Address, credentials: &Credentials, traffic: &Traffic) -> Result<Channel, String> {
     let traffic = traffic.clone();
-    let channel = match address.clone() {
+    Ok(match address.clone() {
         Address::Tcp(at) => {
             let endpoint = endpoint(&at, credentials)?;
             channel(&endpoint, move || {
@@ -123,8 +136,7 @@ pub fn connect_counted(address: &Address, credentials: &Credentials, traffic: &T
         Address::Unix(_) => channel(&NAMELESS, || async {
             Err::<tokio::net::TcpStream, _>(io::Error::new(io::ErrorKind::Unsupported, "no Unix sockets here"))
         }),
-    };
-    Ok(InterceptedService::new(channel, credentials.bearer()))
+    })
 }
 
 /// Where it does not matter what the Host header says, because `open` knows where to go.

@@ -12,6 +12,9 @@ use tonic::{Request, Status};
 
 use crate::client::Address;
 
+/// Header that names the relays a call has passed, separated by spaces.
+pub const RELAYS: &str = "ambience-relays";
+
 /// Environment variables for what is not given as an option.
 const TOKEN: &str = "AMBIENCE_TOKEN";
 const AUTHORITY: &str = "AMBIENCE_TLS_CA";
@@ -90,7 +93,8 @@ impl Credentials {
         self.authority.as_ref().map(|authority| authority.certificate.clone())
     }
 
-    pub(crate) fn bearer(&self) -> Bearer {
+    /// The token.
+    pub fn bearer(&self) -> Bearer {
         self.bearer.clone()
     }
 }
@@ -115,7 +119,11 @@ impl Authority {
 
 /// Adds the token, if there is one, to every call. It is marked sensitive, so that no log shows it.
 #[derive(Clone, Debug, Default)]
-pub struct Bearer(Option<MetadataValue<Ascii>>);
+pub struct Bearer {
+    authorization: Option<MetadataValue<Ascii>>,
+    /// Those a call has passed, if this is a relay.
+    relays: Option<MetadataValue<Ascii>>,
+}
 
 const SCHEME: &str = "Bearer ";
 
@@ -126,18 +134,33 @@ impl Bearer {
         }
         let mut value = MetadataValue::try_from(format!("{SCHEME}{token}")).ok()?;
         value.set_sensitive(true);
-        Some(Self(Some(value)))
+        Some(Self { authorization: Some(value), relays: None })
+    }
+
+    /// What a caller showed, shown again by a relay.
+    pub fn relayed(authorization: Option<&[u8]>, relays: &str) -> Self {
+        let mut authorization = authorization.and_then(|value| MetadataValue::try_from(value).ok());
+        authorization.iter_mut().for_each(|value| value.set_sensitive(true));
+        Self { authorization, ..Self::default() }.passing(relays)
+    }
+
+    /// The same, of a relay.
+    pub fn passing(self, relays: &str) -> Self {
+        Self { relays: MetadataValue::try_from(relays).ok(), ..self }
     }
 
     fn token(&self) -> Option<&str> {
-        self.0.as_ref()?.to_str().ok()?.strip_prefix(SCHEME)
+        self.authorization.as_ref()?.to_str().ok()?.strip_prefix(SCHEME)
     }
 }
 
 impl Interceptor for Bearer {
     fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
-        if let Some(value) = &self.0 {
+        if let Some(value) = &self.authorization {
             request.metadata_mut().insert("authorization", value.clone());
+        }
+        if let Some(relays) = &self.relays {
+            request.metadata_mut().insert(RELAYS, relays.clone());
         }
         Ok(request)
     }

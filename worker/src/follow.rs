@@ -1,5 +1,6 @@
 //! Keeps a [`Replica`] following the server's log of its namespace, and gives back to the server what it lost.
 
+use std::future::Future;
 use std::pin::pin;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
@@ -41,28 +42,43 @@ struct Held {
     aside: Option<Replica>,
 }
 
-/// How far a replica is.
+/// How far a replica is, and how its subscription stands.
 #[derive(Clone, Default)]
-struct Reached {
-    epoch: u64,
-    position: u64,
+pub struct State {
+    /// Which log.
+    pub epoch: u64,
+    /// How much of it is here.
+    pub position: u64,
+    /// How long it was when the subscription began.
+    pub end: u64,
+    /// Whether there is a subscription.
+    pub open: bool,
+    /// Why the last one ended, if there is none.
+    pub ended: Option<Status>,
+    /// How many have ended.
+    pub attempts: u64,
+}
+
+impl State {
     /// The server does not let us read the namespace.
-    refused: Option<Status>,
+    fn refused(&self) -> Option<Status> {
+        self.ended.clone().filter(|status| matches!(status.code(), Code::PermissionDenied | Code::Unauthenticated))
+    }
 }
 
 /// What is reached, and who waits for it: woken in the order in which they began to wait, so that a simulation of a
 /// farm replays.
 struct Progress {
-    reached: Mutex<Reached>,
+    reached: Mutex<State>,
     changed: Notify,
 }
 
 impl Progress {
-    fn now(&self) -> Reached {
+    fn now(&self) -> State {
         lock(&self.reached).clone()
     }
 
-    fn change(&self, change: impl FnOnce(&mut Reached)) {
+    fn change(&self, change: impl FnOnce(&mut State)) {
         change(&mut lock(&self.reached));
         self.changed.notify_waiters();
     }
@@ -88,7 +104,7 @@ impl Follower {
     /// Subscribes to `namespace`.
     pub fn start(cache: Cache, namespace: Namespace) -> Self {
         let held = Arc::new(Mutex::new(Held { replica: Replica::new(namespace), aside: None }));
-        let reached = Mutex::new(Reached { epoch: 1, ..Reached::default() });
+        let reached = Mutex::new(State { epoch: 1, ..State::default() });
         let reached = Arc::new(Progress { reached, changed: Notify::new() });
         let (left, leaving) = watch::channel(0);
         let (wanted, received) = (Arc::new(Notify::new()), Arc::new(AtomicU64::new(0)));
@@ -117,7 +133,7 @@ impl Follower {
         loop {
             let changed = self.reached.changed.notified();
             let now = self.reached.now();
-            if let Some(status) = now.refused {
+            if let Some(status) = now.refused() {
                 return Err(status);
             }
             // What is to be left does not count.
@@ -131,6 +147,21 @@ impl Follower {
             // Look again now and then, whether or not something came.
             drop(tokio::time::timeout(LOOK, changed).await);
         }
+    }
+
+    /// How things stand.
+    pub fn state(&self) -> State {
+        self.reached.now()
+    }
+
+    /// The next change of [`Self::state`] after this call.
+    pub fn changed(&self) -> impl Future<Output = ()> {
+        self.reached.changed.notified()
+    }
+
+    /// Somebody waits: a subscription to a draft that was no more is tried again.
+    pub fn ask(&self) {
+        self.wanted.notify_one();
     }
 
     /// Follows the server's log from its beginning, if the one that is followed now is of `epoch`: it is not what the
@@ -174,17 +205,18 @@ impl Feed {
         let mut backoff = Backoff::default();
         loop {
             let before = self.here();
-            match self.subscribe().await {
-                Ok(()) => debug!("the subscription ended"),
-                Err(status) if matches!(status.code(), Code::PermissionDenied | Code::Unauthenticated) => {
-                    return self.reached.change(|reached| reached.refused = Some(status));
-                }
-                Err(status) if status.code() == Code::NotFound => {
-                    // A published draft: nothing comes any more, unless a frame fills it again or the server is lost.
-                    debug!("{status}");
-                    drop(tokio::time::timeout(REST, self.wanted.notified()).await);
-                }
-                Err(status) => debug!("subscription ended: {status}"),
+            let ended = self.subscribe().await.err().unwrap_or_else(|| Status::unavailable("the server ended it"));
+            debug!("subscription ended: {ended}");
+            let gone = ended.code() == Code::NotFound;
+            self.reached.change(|state| {
+                (state.open, state.ended, state.attempts) = (false, Some(ended), state.attempts + 1);
+            });
+            if self.reached.now().refused().is_some() {
+                return;
+            }
+            if gone {
+                // A published draft: nothing comes any more, unless a frame fills it again or the server is lost.
+                drop(tokio::time::timeout(REST, self.wanted.notified()).await);
             }
             if self.here() != before {
                 backoff = Backoff::default();
@@ -219,6 +251,7 @@ impl Feed {
             }
             start => return Err(Status::internal(format!("the stream starts at {start}, asked for {position}"))),
         }
+        self.reached.change(|state| (state.open, state.ended, state.end) = (true, None, first.end));
         let mut refilling = lock(&self.held).aside.is_some();
         let refill = refill(self.cache.clone(), self.namespace, self.held.clone(), self.reached.clone(), first.end);
         let mut refill = pin!(refill);

@@ -149,6 +149,21 @@ impl Replica {
         inserted
     }
 
+    /// What stands at a position: records of one tag and kind, as many as fit one batch, and how many those are.
+    pub fn batch(&self, position: u64) -> Option<(u64, v1::RecordBatch)> {
+        let rest = self.set.since(usize::try_from(position).ok()?);
+        let (tag, first) = rest.first()?;
+        let alike = |(t, record): &&(Tag, Record)| t == tag && record.kind() == first.kind();
+        let count = rest.iter().take(convert::BATCH_RECORDS_MAX).take_while(alike).count();
+        let run = rest[..count].iter().map(|(_, record)| record);
+        Some((count as u64, convert::pack(&self.namespace, *tag, run)))
+    }
+
+    /// Digest of the records below `position`, if they are here.
+    pub fn digest_at(&self, position: u64) -> Option<Digest> {
+        self.arrived(position).ok().map(|end| self.set.prefix(end).digest)
+    }
+
     /// All records below `position`.
     ///
     /// # Errors
