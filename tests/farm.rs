@@ -6,8 +6,9 @@ mod processes;
 
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
 
-use processes::{alive, ambience, busy_worker, children, collect, render, signal, wait_for};
+use processes::{alive, ambience, busy_worker, children, collect, cpu_ticks, render, signal, wait_for};
 use tempfile::TempDir;
 
 #[test]
@@ -103,6 +104,37 @@ fn server_and_workers_started_by_hand_give_the_same_picture() {
     assert!(again.exr == alone.exr, "another picture from the records of the first");
 }
 
+/// One worker begins the picture, another joins, the first leaves in good order, a third joins and ends it.
+#[test]
+fn workers_that_join_and_leave_in_the_middle_change_nothing() {
+    let settings = ["--rays", "4096"];
+    let alone = render("cornell.glb", &[&settings[..], &["--workers", "2"]].concat());
+    let mut farm = Farm::start(&[], 1);
+    let directory = tempfile::tempdir().expect("temporary directory");
+    let mut command =
+        ambience(directory.path(), "cornell.glb", &[&settings[..], &["--server", &farm.address]].concat());
+    let mut child = command.spawn().expect("ambience starts");
+    for _ in 0..2 {
+        farm.busy();
+        farm.join();
+        farm.busy();
+        assert!(child.try_wait().expect("wait").is_none(), "the picture was done too early");
+        // Within the grace of any scheduler, and it is no failure.
+        let mut leaving = farm.workers.remove(0);
+        signal(leaving.id(), "TERM");
+        let asked = Instant::now();
+        assert!(leaving.wait().expect("wait").success());
+        assert!(asked.elapsed() < Duration::from_secs(5));
+    }
+    assert!(child.wait().expect("wait").success());
+    let run = collect(directory.path());
+    // What it had was given back, not waited for.
+    assert!(run.stats["leases_lost"].as_u64() >= Some(1), "{}", run.stats);
+    assert_eq!(run.records(), alone.records());
+    assert!(run.exr == alone.exr, "another picture");
+    farm.end();
+}
+
 /// What a server will never have room for is not asked for again and again, and the next who asks for less has it.
 #[test]
 fn a_permanent_bound_ends_the_frame_with_one_line() {
@@ -127,6 +159,12 @@ fn a_permanent_bound_ends_the_frame_with_one_line() {
     }
 }
 
+fn start(args: &[&str]) -> Child {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ambience"));
+    command.args(args).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    command.spawn().expect("ambience starts")
+}
+
 /// A server and workers of one thread, started by hand.
 struct Farm {
     address: String,
@@ -140,16 +178,23 @@ impl Farm {
         let directory = tempfile::tempdir().expect("temporary directory");
         let socket = directory.path().join("socket");
         let address = format!("unix:{}", socket.display());
-        let start = |args: &[&str]| {
-            let mut command = Command::new(env!("CARGO_BIN_EXE_ambience"));
-            command.args(args).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
-            command.spawn().expect("ambience starts")
-        };
         let server = start(&[&["serve", "--listen", &address], options].concat());
         wait_for("the socket", || socket.exists().then_some(()));
-        let worker = |_| start(&["worker", "--server", &address, "--threads", "1"]);
-        let workers = (0..workers).map(worker).collect();
-        Self { workers, server, address, _directory: directory }
+        let mut farm = Self { workers: Vec::new(), server, address, _directory: directory };
+        (0..workers).for_each(|_| farm.join());
+        farm
+    }
+
+    /// One worker more.
+    fn join(&mut self) {
+        self.workers.push(start(&["worker", "--server", &self.address, "--threads", "1"]));
+    }
+
+    /// Waits until the worker that came last is in the middle of its work.
+    fn busy(&self) {
+        let last = self.workers.last().expect("a worker").id();
+        let before = cpu_ticks(last);
+        wait_for("a busy worker", || (cpu_ticks(last) >= before + 20).then_some(()));
     }
 
     /// Ends it in good order.
