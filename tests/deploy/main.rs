@@ -24,7 +24,7 @@ fn main() {
             let ran = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run));
             ran.map_err(|panic| {
                 let said = panic.downcast_ref::<String>().cloned();
-                Failed::from(said.or(panic.downcast_ref::<&str>().map(|said| said.to_string())))
+                Failed::from(said.unwrap_or_else(|| "it panicked".into()))
             })
         }),
         Err(why) => {

@@ -55,7 +55,8 @@ struct Cluster {
 impl Cluster {
     fn start() -> Self {
         let folder = tempfile::tempdir().expect("a folder");
-        let at = |name: &str| folder.path().join(name).display().to_string();
+        let place = folder.path().to_path_buf();
+        let at = |name: &str| place.join(name).display().to_string();
         for name in ["state", "spool"] {
             std::fs::create_dir(at(name)).expect("a folder");
         }
