@@ -434,7 +434,7 @@ fn what_a_worker_says_wrong_is_named_and_its_lease_stays() {
 fn an_owner_is_asked_for_the_scene_once() {
     let mut frames = Frames::new(Limits::default(), 1);
     let frame = open(&mut frames, 4, 0);
-    let mut asked = |frames: &mut Frames| {
+    let asked = |frames: &mut Frames| {
         let mut asked = 0;
         while let News::Tell(event) = frames.news(frame, |_, _| Mark::default()) {
             asked += usize::from(matches!(event.event, Some(v1::frame_event::Event::SceneWanted(_))));
