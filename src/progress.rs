@@ -131,8 +131,18 @@ impl Progress {
         }
     }
 
-    /// Removes the bar.
-    pub fn finish(&self) {
+    /// All is done.
+    pub fn finish(&mut self) {
+        match &mut self.shown {
+            Shown::OpenJd(told) if *told < 100 => {
+                *told = 100;
+                drop(say::result("openjd_progress: 100"));
+            }
+            _ => self.clear(),
+        }
+    }
+
+    fn clear(&self) {
         if let Shown::Bar(bar) = &self.shown {
             bar.finish_and_clear();
         }
@@ -141,7 +151,7 @@ impl Progress {
 
 impl Drop for Progress {
     fn drop(&mut self) {
-        self.finish();
+        self.clear();
     }
 }
 
