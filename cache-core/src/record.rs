@@ -151,6 +151,11 @@ impl Record {
         }
     }
 
+    /// As how many records of irradiance it counts where memory is bounded: large ones as several.
+    pub fn units(&self) -> usize {
+        Self::bytes(self.kind()).map_or(1, |bytes| bytes.div_ceil(Irradiance::BYTES))
+    }
+
     /// Whether it is sound, whoever made it.
     ///
     /// # Errors

@@ -79,6 +79,8 @@ pub struct RecordSet {
     /// Positions whose record took the place of an earlier one.
     replaced: BTreeSet<usize>,
     conflicts: u64,
+    /// Of all in the log.
+    units: usize,
 }
 
 /// Where the record of each id stands in the log.
@@ -147,7 +149,7 @@ impl RecordSet {
             Entry::Vacant(slot) => {
                 slot.insert(new);
                 self.steps.entry(tag.step).or_default().add(id);
-                self.log.push((tag, record.clone()));
+                self.push(tag, record);
                 return Inserted::Added;
             }
             Entry::Occupied(slot) => slot,
@@ -166,8 +168,18 @@ impl RecordSet {
         self.steps.entry(tag.step).or_default().add(id);
         *slot.get_mut() = new;
         self.replaced.insert(new.at as usize);
-        self.log.push((tag, record.clone()));
+        self.push(tag, record);
         Inserted::Replaced
+    }
+
+    fn push(&mut self, tag: Tag, record: &Record) {
+        self.units += record.units();
+        self.log.push((tag, record.clone()));
+    }
+
+    /// [`Record::units`] of the whole log.
+    pub fn units(&self) -> usize {
+        self.units
     }
 
     /// Records in the set.

@@ -95,7 +95,7 @@ impl Replica {
         }
     }
 
-    /// Whether there is room for `count` more records of a namespace, should all of them be new. Makes room by giving up
+    /// Whether there is room for `count` more records of a namespace, large ones as several, should all of them be new. Makes room by giving up
     /// drafts no frame fills: they are what interrupted frames left.
     ///
     /// # Errors
@@ -112,7 +112,7 @@ impl Replica {
     /// Gives up a namespace. Drafts published to it are drafts no more: their records are gone.
     fn forget(&mut self, namespace: &Namespace) {
         let Some(kept) = self.kept.remove(namespace) else { return };
-        self.held -= kept.set.position();
+        self.held -= kept.set.units();
         self.published.retain(|_, published| published.namespace != *namespace);
         self.publications.retain(|draft| self.published.contains_key(draft));
     }
@@ -134,26 +134,27 @@ impl Replica {
         if records.is_empty() {
             return Ok(Added { added: 0, position: self.mark(&namespace).position });
         }
+        let units = records.iter().map(Record::units).sum::<usize>();
         let published = self.published.get(&namespace).map(|published| published.namespace);
         if let Some(into) = published {
-            self.admit(&into, 2 * records.len())?;
+            self.admit(&into, 2 * units)?;
             self.unite(into, tag, records);
             if !self.kept.contains_key(&namespace) {
                 return Ok(Added::default());
             }
         }
-        self.admit(&namespace, records.len())?;
+        self.admit(&namespace, units)?;
         Ok(self.unite(namespace, tag, records))
     }
 
     /// Unites with records there is room for.
     fn unite(&mut self, namespace: Namespace, tag: Tag, records: &[Record]) -> Added {
         let set = &mut self.kept.entry(namespace).or_default().set;
-        let (before, known) = (set.position(), set.len());
+        let (before, known) = (set.units(), set.len());
         for id in set.extend(tag, records) {
             tracing::warn!(id = format_args!("{:032x}", { id.0 }), "a record came twice with different content");
         }
-        self.held += set.position() - before;
+        self.held += set.units() - before;
         Added { added: (set.len() - known) as u64, position: set.position() as u64 }
     }
 
@@ -173,14 +174,14 @@ impl Replica {
     /// The records of a draft belong to a namespace from now on, and so do those that come later.
     fn publish(&mut self, draft: Namespace, namespace: Namespace) -> Result<Added, Refusal> {
         let log = self.kept.get(&draft).map_or(Vec::new(), |kept| kept.set.since(0).to_vec());
-        self.admit(&namespace, log.len())?;
+        self.admit(&namespace, units(&log))?;
         let set = &mut self.kept.entry(namespace).or_default().set;
-        let (start, known) = (set.position(), set.len());
+        let (start, known, before) = (set.position(), set.len(), set.units());
         for (tag, record) in log {
             set.insert(tag, record);
         }
         let (end, added) = (set.position(), (set.len() - known) as u64);
-        self.held += end - start;
+        self.held += set.units() - before;
         // Said again, it brings nothing new: the first time tells which part of the log the draft is.
         if let Entry::Vacant(first) = self.published.entry(draft) {
             first.insert(Published { namespace, range: start..end });
@@ -200,14 +201,14 @@ impl Replica {
             let log = self.kept.get(&published.namespace)?.set.since(0);
             log.get(published.range.clone()).map(<[_]>::to_vec)
         });
-        let again = again.filter(|log| self.admit(&draft, log.len()).is_ok());
+        let again = again.filter(|log| self.admit(&draft, units(log)).is_ok());
         let kept = self.kept.entry(draft).or_default();
         kept.holds += 1;
-        let before = kept.set.position();
+        let before = kept.set.units();
         for (tag, record) in again.unwrap_or_default() {
             kept.set.insert(tag, record);
         }
-        self.held += kept.set.position() - before;
+        self.held += kept.set.units() - before;
     }
 
     /// A frame has ended: a draft no other frame fills is forgotten if it was published, or nothing is known of it.
@@ -354,9 +355,13 @@ impl Replica {
     }
 }
 
+fn units(log: &[(Tag, Record)]) -> usize {
+    log.iter().map(|(_, record)| record.units()).sum()
+}
+
 #[cfg(test)]
 mod tests {
-    use cache_core::{Irradiance, RecordId, Shrink};
+    use cache_core::{Irradiance, Radiance, RecordId, Shrink};
     use glam::{Vec2, Vec3};
     use proptest::prelude::*;
 
@@ -419,6 +424,29 @@ mod tests {
                 prop_assert_eq!(near.level(&NAMESPACE, level), far.level(&NAMESPACE, level));
             }
         }
+    }
+
+    /// A record of radiance of order 10 takes as much as 29 of irradiance.
+    #[test]
+    fn large_records_count_as_several() {
+        let large = |id| Radiance::<100> {
+            id: RecordId(id),
+            position: Vec3::ZERO,
+            normal: Vec3::Y,
+            radius: 1.0,
+            radius_min: 0.1,
+            radius_max: 2.0,
+            ellipse: [0.0; 3],
+            noise: 0.0,
+            coefficients: [[0.5; 100]; 3],
+            gradient: [[[0.0; 100]; 3]; 2],
+        };
+        let mut replica = Replica::new(Limits { records: 60, ..Limits::default() });
+        let mut insert = |id: u128| replica.insert(NAMESPACE, Tag::level(1), &[large(id).into()]);
+        assert!(insert(1).is_ok() && insert(2).is_ok());
+        assert!(matches!(insert(3), Err(Refusal::Full { what: "records", most: 60 })));
+        assert_eq!(replica.census(), (58, 1));
+        replica.insert(NAMESPACE, Tag::level(1), &[record(9, 0.0)]).expect("room for a small one");
     }
 
     #[test]

@@ -1,7 +1,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use cache_core::{Irradiance, RecordId, Shrink};
+use cache_core::{Irradiance, Radiance, RecordId, Shrink};
 use glam::{Vec2, Vec3};
 use proptest::prelude::*;
 
@@ -239,8 +239,8 @@ fn what_is_wrong_with_a_line_is_named() {
         (sevens.as_str(), "0707", "line 1: namespace has 2 bytes, expected 32"),
         (
             "irradiance\",\"level",
-            "radiance\",\"level",
-            "line 1: kind: unknown variant `radiance`, expected `irradiance` or `shrink`",
+            "light\",\"level",
+            "line 1: kind: unknown variant `light`, expected one of `irradiance`, `shrink`, `radiance`",
         ),
         ("\"seed\":18446744073709551615", "\"seed\":-1", "line 2: seed: "),
         ("{\"type\":\"label\"", "{\"type\":\"lable\"", "line 2: type: unknown variant `lable`"),
@@ -259,6 +259,39 @@ fn what_is_wrong_with_a_line_is_named() {
     }
     let long = "x".repeat(100_000);
     assert!(json::read(long.as_bytes(), &mut |_| Ok(())).expect_err("long").contains("line 1: longer than"));
+}
+
+/// Records of every kind come back from their lines bit for bit.
+#[test]
+fn records_of_radiance_have_lines() {
+    let mut bits = 0u32;
+    let mut next = || {
+        bits = bits.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        f32::from_bits(bits >> 9 | 0x3f80_0000) - 1.5
+    };
+    let mut coefficients = || [0; 3].map(|_| [0; 16].map(|_| next()));
+    let record = Radiance::<16> {
+        id: RecordId(77),
+        position: Vec3::new(0.1, 2.0, -3.0),
+        normal: Vec3::Z,
+        radius: 0.3,
+        radius_min: 0.01,
+        radius_max: 0.7,
+        ellipse: [1.0, 0.1, 2.0],
+        noise: 0.003,
+        coefficients: coefficients(),
+        gradient: [coefficients(), coefficients()],
+    };
+    let batch = convert::pack(&NAMESPACE, Tag { level: 1, step: 4 }, &[record]);
+    let entry = v1::Entry { entry: Some(Kind::Batch(batch)) };
+    let mut lines = Vec::new();
+    json::write(&mut lines, &entry).expect("memory");
+    let mut back = Vec::new();
+    json::read(lines.as_slice(), &mut |entry| Ok(back.push(entry))).expect("sound");
+    assert_eq!(back, [entry]);
+    let short = String::from_utf8(lines).expect("text").replacen("\"coefficients\":[[", "\"coefficients\":[[1.0,", 1);
+    let error = json::read(short.as_bytes(), &mut |_| Ok(())).expect_err("one too many");
+    assert!(error.starts_with("line 1: coefficients is 17, expected 4, 16, 36, 64 or 100"), "{error}");
 }
 
 #[test]
