@@ -287,7 +287,11 @@ fn records_of_radiance_have_lines() {
     let mut lines = Vec::new();
     json::write(&mut lines, &entry).expect("memory");
     let mut back = Vec::new();
-    json::read(lines.as_slice(), &mut |entry| Ok(back.push(entry))).expect("sound");
+    let mut take = |entry| {
+        back.push(entry);
+        Ok(())
+    };
+    json::read(lines.as_slice(), &mut take).expect("sound");
     assert_eq!(back, [entry]);
     let short = String::from_utf8(lines).expect("text").replacen("\"coefficients\":[[", "\"coefficients\":[[1.0,", 1);
     let error = json::read(short.as_bytes(), &mut |_| Ok(())).expect_err("one too many");
