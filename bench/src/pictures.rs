@@ -4,12 +4,12 @@
 //! filling and pixels together, loading apart.
 
 use std::error::Error;
-use std::time::Instant;
 
 use crate::judge::{SIZE, judge, load, reduce, reference, rgb, settings};
 use worker::frame::Frame;
 use worker::settings::{Method, Settings};
 use worker::solo::{self, Order};
+use worker::task::CpuClock;
 
 const SCENES: [&str; 5] = ["cornell.full", "stairs.full", "leak.full", "sphere-plane.one", "glossy-floor.full"];
 
@@ -28,7 +28,7 @@ pub fn run(mut asked: Vec<String>) -> Result<(), Box<dyn Error>> {
     println!("{edge}x{edge}, one thread; errors relative to the reference's mean");
     println!(
         "{:20} {:28} {:>8} {:>8} {:>7} {:>7} {:>7}",
-        "scene", "settings", "seconds", "records", "RMSE", "bias", "worst"
+        "scene", "settings", "CPU s", "records", "RMSE", "bias", "worst"
     );
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
     for name in names {
@@ -45,13 +45,12 @@ pub fn run(mut asked: Vec<String>) -> Result<(), Box<dyn Error>> {
                 _ => format!("--rays {} --a {} --spp {}", settings.rays, settings.a, settings.spp),
             };
             let frame = Frame::new(scene.clone(), settings);
-            let start = Instant::now();
-            let (levels, pixels) = one_thread.install(|| {
+            let (levels, pixels, seconds) = one_thread.install(|| {
+                let clock = CpuClock::start();
                 let levels = solo::fill(&frame, Order::Rounds);
                 let pixels = solo::pixels(&frame, &levels).0;
-                (levels, pixels)
+                (levels, pixels, clock.seconds())
             });
-            let seconds = start.elapsed().as_secs_f64();
             let records: usize = levels.iter().map(|l| l.len()).sum();
             let image = rgb(&pixels);
             let v = judge(&reduce(&image), &truth);

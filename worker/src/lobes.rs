@@ -1,6 +1,6 @@
 //! The gloss of materials as records of radiance see it: lobes in hemispherical harmonics (Krivanek et al. 2005, 4.1).
 //!
-//! A material's gloss is a sum of colours times lobes that depend on its roughness alone ([`Shape`]); colours may come from
+//! A material's gloss is a sum of colours times lobes that depend on its roughness alone ([`Shape`](crate::bsdf::Shape)); colours may come from
 //! textures. What the least order that suffices misses decides whether records serve it at all; where the camera looks along
 //! the surface lobes are sharper, and single samples go without.
 
