@@ -185,7 +185,7 @@ where
     chart
         .configure_mesh()
         .x_desc(below)
-        .x_labels(6)
+        .x_labels(12)
         .x_label_formatter(&|x| ((x * 1e4).round() / 1e4).to_string())
         .draw()?;
     for (at, (label, points)) in curves.iter().enumerate() {
