@@ -73,8 +73,8 @@ impl Tree {
         Process::start(&mut self.command(&["worker", "--threads", "1", "--server", &self.at(at)]))
     }
 
-    fn render(&self, at: &str, out: &Path, more: &[&str]) -> Child {
-        let mut command = ambience(out, "cornell.glb", &[more, &["--server", &self.at(at)]].concat());
+    fn render(&self, scene: &str, at: &str, out: &Path, more: &[&str]) -> Child {
+        let mut command = ambience(out, scene, &[more, &["--server", &self.at(at)]].concat());
         command.stderr(Stdio::null()).spawn().expect("ambience starts")
     }
 }
@@ -105,7 +105,9 @@ fn a_tree_of_relays_gives_the_same_picture_over_one_subscription_each() {
         tree.worker("right"),
     ];
     let out = tempfile::tempdir().expect("a folder");
-    let mut render = tree.render("low", out.path(), &["--rays", "1024", "--workers", "0"]);
+    // Records of both kinds.
+    let (scene, settings) = ("glossy-floor.glb", ["--rays", "1024", "--method", "radiance", "--workers"]);
+    let mut render = tree.render(scene, "low", out.path(), &[&settings[..], &["0"]].concat());
     let root: client::Address = tree.at("root").parse().expect("an address");
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
     let mut most = 0;
@@ -120,7 +122,8 @@ fn a_tree_of_relays_gives_the_same_picture_over_one_subscription_each() {
     assert!(status.success(), "{status}");
     // The draft, once for the left and once for the right.
     assert_eq!(most, 2, "subscriptions at the root");
-    let (run, alone) = (collect(out.path()), processes::render("cornell.glb", &["--rays", "1024", "--workers", "2"]));
+    let (run, alone) = (collect(out.path()), processes::render(scene, &[&settings[..], &["2"]].concat()));
+    assert!(run.stats["records"]["radiance"].as_u64() > Some(100), "{}", run.stats);
     assert_eq!(run.records(), alone.records());
     assert!(run.exr == alone.exr, "another picture");
 }
@@ -136,7 +139,7 @@ fn a_server_that_is_away_behind_its_relays_changes_nothing() {
         let _relays = [tree.relay("left", "root"), tree.relay("right", "root")];
         let workers = [tree.worker("left"), tree.worker("right")];
         let out = tempfile::tempdir().expect("a folder");
-        let render = tree.render("left", out.path(), &SLOW);
+        let render = tree.render("cornell.glb", "left", out.path(), &SLOW);
         busy(&workers[0]);
         root.kill();
         std::fs::remove_file(tree.0.path().join("root")).expect("its socket");
@@ -163,7 +166,7 @@ fn a_worker_that_moves_to_another_relay_changes_nothing() {
     // The only one, so that nobody else finishes the picture.
     let worker = tree.worker("near");
     let out = tempfile::tempdir().expect("a folder");
-    let render = tree.render("right", out.path(), &SLOW);
+    let render = tree.render("cornell.glb", "right", out.path(), &SLOW);
     busy(&worker);
     std::fs::remove_file(&near).expect("there");
     symlink(tree.0.path().join("right"), &near).expect("linked");

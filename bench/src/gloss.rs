@@ -4,9 +4,9 @@
 use std::error::Error;
 
 use cache_core::details::Details;
+use cache_core::radiance::ORDERS;
 use cache_core::rounds::RANKS;
 use worker::frame::Frame;
-use worker::lobes::ORDERS;
 use worker::pilot;
 use worker::scene::{Camera, Rgb, Scene, Surface};
 use worker::settings::{Method, Settings};

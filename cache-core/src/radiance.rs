@@ -258,6 +258,34 @@ pub const fn kind(order: usize) -> u32 {
     KIND_BASE + order as u32
 }
 
+/// Order of the records of a kind; none of [`ORDERS`] for other kinds.
+pub(crate) fn order_of(kind: u32) -> usize {
+    kind.saturating_sub(KIND_BASE) as usize
+}
+
+/// Orders there are records of.
+pub const ORDERS: [usize; 5] = [2, 4, 6, 8, 10];
+
+/// `$work` with `$N` being the number of coefficients of an order; `None` for an order that is none of
+/// [`ORDERS`](crate::radiance::ORDERS).
+#[macro_export]
+macro_rules! of_order {
+    ($order:expr, $N:ident => $work:expr) => {
+        match $order {
+            2 => $crate::of_order!(@ 4, $N => $work),
+            4 => $crate::of_order!(@ 16, $N => $work),
+            6 => $crate::of_order!(@ 36, $N => $work),
+            8 => $crate::of_order!(@ 64, $N => $work),
+            10 => $crate::of_order!(@ 100, $N => $work),
+            _ => None,
+        }
+    };
+    (@ $coefficients:literal, $N:ident => $work:expr) => {{
+        const $N: usize = $coefficients;
+        Some($work)
+    }};
+}
+
 /// Floats between the id and the coefficients.
 const HEAD: usize = 13;
 

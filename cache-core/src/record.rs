@@ -8,7 +8,8 @@ use crate::cached::{Invalid, Packed};
 use crate::hsh::order;
 use crate::id::RecordId;
 use crate::irradiance::Irradiance;
-use crate::radiance::{Plain, Radiance};
+use crate::of_order;
+use crate::radiance::{ORDERS, Plain, Radiance, order_of};
 use crate::shrink::Shrink;
 
 /// A record of any kind.
@@ -69,7 +70,7 @@ impl<const N: usize> Erased for Radiance<N> {
 
 impl Ordered {
     /// The record, if it has N coefficients.
-    pub fn of<const N: usize>(&self) -> Option<&Radiance<N>> {
+    fn of<const N: usize>(&self) -> Option<&Radiance<N>> {
         (&*self.0 as &dyn Any).downcast_ref()
     }
 
@@ -100,26 +101,6 @@ impl fmt::Debug for Ordered {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         self.0.text(f)
     }
-}
-
-/// Does `$work` with `$record` being the type of records of `$kind`; `None` for a kind this build does not know.
-macro_rules! of_kind {
-    ($kind:expr, $record:ident => $work:expr) => {
-        match $kind {
-            Irradiance::KIND => Some(of_kind!(@ Irradiance, $record => $work)),
-            Shrink::KIND => Some(of_kind!(@ Shrink, $record => $work)),
-            Radiance::<4>::KIND => Some(of_kind!(@ Radiance<4>, $record => $work)),
-            Radiance::<16>::KIND => Some(of_kind!(@ Radiance<16>, $record => $work)),
-            Radiance::<36>::KIND => Some(of_kind!(@ Radiance<36>, $record => $work)),
-            Radiance::<64>::KIND => Some(of_kind!(@ Radiance<64>, $record => $work)),
-            Radiance::<100>::KIND => Some(of_kind!(@ Radiance<100>, $record => $work)),
-            _ => None,
-        }
-    };
-    (@ $type:ty, $record:ident => $work:expr) => {{
-        type $record = $type;
-        $work
-    }};
 }
 
 impl Record {
@@ -173,23 +154,22 @@ impl Record {
     /// # Errors
     /// What is unsound about it.
     pub fn radiance(plain: &Plain) -> Result<Self, Invalid> {
-        let record = match plain.coefficients[0].len() {
-            4 => Radiance::<4>::try_from(plain)?.into(),
-            16 => Radiance::<16>::try_from(plain)?.into(),
-            36 => Radiance::<36>::try_from(plain)?.into(),
-            64 => Radiance::<64>::try_from(plain)?.into(),
-            100 => Radiance::<100>::try_from(plain)?.into(),
-            many => {
-                let expected = "4, 16, 36, 64 or 100 of each channel";
-                return Err(Invalid::Range { field: "coefficients", value: many as f32, expected });
-            }
-        };
+        let many = plain.coefficients[0].len();
+        let order = ORDERS.into_iter().find(|order| order * order == many);
+        let record = order.and_then(|order| of_order!(order, N => Radiance::<N>::try_from(plain).map(Self::from)));
+        let expected = "4, 16, 36, 64 or 100 of each channel";
+        let unknown = Err(Invalid::Range { field: "coefficients", value: many as f32, expected });
+        let record = record.unwrap_or(unknown)?;
         Self::check(&record).map(|()| record)
     }
 
     /// Bytes of a packed record of a kind; `None` for a kind this build does not know.
     pub fn bytes(kind: u32) -> Option<usize> {
-        of_kind!(kind, Kind => Kind::BYTES)
+        match kind {
+            Irradiance::KIND => Some(Irradiance::BYTES),
+            Shrink::KIND => Some(Shrink::BYTES),
+            other => of_order!(order_of(other), N => Radiance::<N>::BYTES),
+        }
     }
 
     /// Reads and checks one record of a kind; `None` for a kind this build does not know.
@@ -197,7 +177,11 @@ impl Record {
     /// # Errors
     /// What is unsound about it.
     pub fn decode(kind: u32, bytes: &[u8]) -> Option<Result<Self, Invalid>> {
-        of_kind!(kind, Kind => Kind::decode(bytes).map(Self::from))
+        match kind {
+            Irradiance::KIND => Some(Irradiance::decode(bytes).map(Self::from)),
+            Shrink::KIND => Some(Shrink::decode(bytes).map(Self::from)),
+            other => of_order!(order_of(other), N => Radiance::<N>::decode(bytes).map(Self::from)),
+        }
     }
 }
 

@@ -144,6 +144,11 @@ impl<C: Cached> Sealed<C> {
         }
     }
 
+    /// What was proposed: of each record the least, in no order.
+    pub fn proposals(&self) -> impl Iterator<Item = Shrink> {
+        self.proposed.iter().map(|(of, a)| Shrink::new(*of, *a))
+    }
+
     /// [`Self::extend`] and [`Self::shrink`] in one: what is of neither kind is left out.
     pub fn unite<'a>(&mut self, new: impl IntoIterator<Item = &'a Record>)
     where

@@ -232,12 +232,8 @@ impl Replica {
     /// # Errors
     /// [`Refusal::PastEnd`], [`Refusal::Published`].
     pub fn read(&self, namespace: &Namespace, position: u64) -> Result<Option<(u64, v1::RecordBatch)>, Refusal> {
-        let rest = self.since(namespace, position)?;
-        let Some((tag, first)) = rest.first() else { return Ok(None) };
-        let alike = |(t, record): &&(Tag, Record)| t == tag && record.kind() == first.kind();
-        let count = rest.iter().take(convert::batch_max(first.kind())).take_while(alike).count();
-        let run = rest[..count].iter().map(|(_, record)| record);
-        Ok(Some((count as u64, convert::pack(namespace, *tag, run))))
+        let first = convert::batches(namespace, self.since(namespace, position)?).next();
+        Ok(first.map(|(count, batch)| (count as u64, batch)))
     }
 
     /// The log of a namespace from a position on, in order of arrival.

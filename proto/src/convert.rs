@@ -1,5 +1,7 @@
 //! The only place where bytes from the wire become records, and core's steps become messages.
 
+use std::borrow::Borrow;
+
 use cache_core::id::Digest;
 use cache_core::set::Tag;
 use cache_core::{Invalid, Irradiance, Namespace, Packed as _, Record, rounds};
@@ -13,7 +15,7 @@ pub const BATCH_RECORDS_MAX: usize = 4096;
 const BATCH_BYTES_MAX: usize = BATCH_RECORDS_MAX * Irradiance::BYTES;
 
 /// Most records of a kind in one batch; 0 for a kind this build does not know.
-pub fn batch_max(kind: u32) -> usize {
+fn batch_max(kind: u32) -> usize {
     Record::bytes(kind).map_or(0, |size| (BATCH_BYTES_MAX / size).min(BATCH_RECORDS_MAX))
 }
 
@@ -105,7 +107,7 @@ pub fn digest_bytes(digest: Digest) -> prost::bytes::Bytes {
     prost::bytes::Bytes::copy_from_slice(&digest.0.to_le_bytes())
 }
 
-/// Packs records of one tag and kind. At most [`batch_max`] of them make a batch a server accepts.
+/// Packs records of one tag and kind, all into one batch. A server accepts no more of them than [`batches`] puts into one.
 pub fn pack<'a, R: Into<Record> + Clone + 'a>(
     namespace: &Namespace,
     tag: Tag,
@@ -125,6 +127,26 @@ pub fn pack<'a, R: Into<Record> + Clone + 'a>(
         records: bytes.into(),
         step: tag.step,
     }
+}
+
+/// The batches that records make, in their order, and how many each holds: those of one tag and kind that follow each other,
+/// as many as a server accepts.
+pub fn batches<R: Borrow<(Tag, Record)>>(
+    namespace: &Namespace,
+    mut records: &[R],
+) -> impl Iterator<Item = (usize, v1::RecordBatch)> {
+    std::iter::from_fn(move || {
+        let (tag, first) = records.first()?.borrow();
+        let kind = first.kind();
+        let alike = |entry: &&R| {
+            let (other, record): &(Tag, Record) = (*entry).borrow();
+            (other, record.kind()) == (tag, kind)
+        };
+        let count = records.iter().take(batch_max(kind)).take_while(alike).count();
+        let (run, rest) = records.split_at(count);
+        records = rest;
+        Some((count, pack(namespace, *tag, run.iter().map(|entry| &entry.borrow().1))))
+    })
 }
 
 /// Reads and checks a batch: its namespace, tag and records.
@@ -230,14 +252,15 @@ pub fn plan_step(step: &v1::Step) -> rounds::Step {
 
 #[cfg(test)]
 mod tests {
-    use cache_core::{RecordId, Shrink};
+    use cache_core::{Radiance, RecordId, Shrink};
+    use glam::Vec3;
     use proptest::prelude::*;
 
     use super::*;
 
     proptest! {
         #[test]
-        fn random_bytes_never_panic_and_never_pass_unsound(bytes in prop::collection::vec(any::<u8>(), 0..600), kind in 0u32..3, level in 0u32..70) {
+        fn random_bytes_never_panic_and_never_pass_unsound(bytes in prop::collection::vec(any::<u8>(), 0..600), kind in prop_oneof![0u32..3, 16u32..28], level in 0u32..70) {
             let batch = v1::RecordBatch { namespace: vec![0; 32].into(), kind, level, records: bytes.into(), step: 0 };
             if let Ok((namespace, tag, records)) = unpack(&batch) {
                 for record in &records {
@@ -278,6 +301,38 @@ mod tests {
         assert_eq!(label(0.3, 0.0), Ok(()));
         assert_eq!(label(f32::NAN, 0.0), Err("a is NaN, expected a finite number".into()));
         assert_eq!(label(0.3, f32::INFINITY), Err("rays_by_deviation is inf, expected a finite number".into()));
+    }
+
+    /// Neither too many nor too large, in their order, whoever packs them.
+    #[test]
+    fn batches_are_as_large_as_a_server_accepts() {
+        let large = |id| {
+            let coefficients = [[0.5; 100]; 3];
+            Record::from(Radiance::<100> {
+                id: RecordId(id),
+                position: Vec3::ZERO,
+                normal: Vec3::Y,
+                radius: 1.0,
+                radius_min: 0.1,
+                radius_max: 2.0,
+                ellipse: [0.0; 3],
+                noise: 0.0,
+                coefficients,
+                gradient: [coefficients; 2],
+            })
+        };
+        let shrink = |id: u128| Record::from(Shrink::new(RecordId(id), 0.1));
+        let mut log: Vec<_> = (0..300).map(|id| (Tag::level(1), large(id))).collect();
+        log.extend((0..5000).map(|id| (Tag::level(1), shrink(id))));
+        log.extend((300..302).map(|id| (Tag::level(1 + id as u32 % 2), large(id))));
+        let batches: Vec<_> = batches(&Namespace([3; 32]), &log).collect();
+        let counts: Vec<_> = batches.iter().map(|(count, _)| *count).collect();
+        assert_eq!(counts, [142, 142, 16, 4096, 904, 1, 1]);
+        let back = batches.iter().flat_map(|(_, batch)| {
+            let (_, tag, records) = unpack(batch).expect("accepted");
+            records.into_iter().map(move |record| (tag, record))
+        });
+        assert!(back.eq(log));
     }
 
     #[test]

@@ -347,13 +347,8 @@ pub struct Kept {
 /// # Errors
 /// The server's.
 pub async fn insert(cache: &mut Cache, namespace: &Namespace, records: &[(Tag, Record)]) -> Result<Kept, Status> {
-    let mut batches = Vec::new();
-    for run in records.chunk_by(|a, b| (a.0, a.1.kind()) == (b.0, b.1.kind())) {
-        for part in run.chunks(convert::batch_max(run[0].1.kind())) {
-            let batch = convert::pack(namespace, part[0].0, part.iter().map(|(_, r)| r));
-            batches.push(v1::InsertRequest { batch: Some(batch) });
-        }
-    }
+    let batches = convert::batches(namespace, records).map(|(_, batch)| v1::InsertRequest { batch: Some(batch) });
+    let batches: Vec<_> = batches.collect();
     let bytes = batches.iter().flat_map(|b| &b.batch).map(|b| b.records.len() as u64).sum();
     let response = cache.insert(tokio_stream::iter(batches)).await?.into_inner();
     Ok(Kept { bytes, position: response.position })

@@ -8,7 +8,7 @@ use cache_core::id::{Origin, Random};
 use cache_core::incoming::Bands;
 use cache_core::math::Frame;
 use cache_core::mesh::turned;
-use cache_core::{Irradiance, Namespace, Packed as _, Query, Radiance, Record, RecordId, radiance};
+use cache_core::{Irradiance, Namespace, Packed as _, Query, Radiance, Record, RecordId, of_order, radiance};
 
 use glam::{Vec2, Vec3};
 
@@ -98,11 +98,9 @@ impl Gather<'_> {
     pub fn record(&self, id: RecordId, site: &Site, counts: &mut Counts) -> Record {
         match site.order {
             None => self.irradiance(id, site, counts).into(),
-            Some(2) => self.radiance::<4>(id, site, counts).into(),
-            Some(4) => self.radiance::<16>(id, site, counts).into(),
-            Some(6) => self.radiance::<36>(id, site, counts).into(),
-            Some(8) => self.radiance::<64>(id, site, counts).into(),
-            Some(_) => self.radiance::<100>(id, site, counts).into(),
+            Some(order) => {
+                of_order!(order, N => self.radiance::<N>(id, site, counts).into()).expect("there are records of it")
+            }
         }
     }
 

@@ -9,7 +9,7 @@ use cache_core::id::Digest;
 use cache_core::radiance::{self, Coefficients};
 use cache_core::sealed::Contribution;
 use cache_core::shrink::Share;
-use cache_core::{Irradiance, Query, Radiance, Record, Sealed};
+use cache_core::{Irradiance, Query, Radiance, Record, Sealed, of_order};
 use smallvec::SmallVec;
 
 use crate::lobes::{Reflection, Served};
@@ -28,8 +28,6 @@ pub struct Level {
     pub irradiance: Arc<Sealed<Irradiance>>,
     /// Light for glossy surfaces, by the order of the records.
     radiance: BTreeMap<usize, Arc<dyn Glossy>>,
-    /// Proposals that records shrink, for those of orders not seen yet.
-    shrinks: Vec<Record>,
 }
 
 /// What records say a surface reflects.
@@ -49,7 +47,7 @@ impl Level {
     /// An empty one whose records will count with the allowed error `a`.
     pub fn new(a: f32, details: Details) -> Self {
         let irradiance = Arc::new(Sealed::with(a, details));
-        Self { a, details, irradiance, radiance: BTreeMap::new(), shrinks: Vec::new() }
+        Self { a, details, irradiance, radiance: BTreeMap::new() }
     }
 
     /// Adds records of all kinds, and proposals that records shrink.
@@ -58,21 +56,16 @@ impl Level {
         if new.is_empty() {
             return;
         }
-        let mut orders: Vec<_> = new
-            .iter()
-            .filter_map(|record| if let Record::Radiance(r) = record { Some(r.order()) } else { None })
-            .collect();
-        orders.sort_unstable();
-        orders.dedup();
-        for order in orders {
-            let Some(mut set) = empty(order, self.a, self.details).filter(|_| !self.radiance.contains_key(&order))
-            else {
-                continue;
-            };
-            if let Some(set) = Arc::get_mut(&mut set) {
-                set.unite(&self.shrinks.iter().collect::<Vec<_>>());
+        for record in &new {
+            let Record::Radiance(record) = record else { continue };
+            if !self.radiance.contains_key(&record.order())
+                && let Some(mut set) = empty(record.order(), self.a, self.details)
+            {
+                // What was proposed so far may be of records that come only now.
+                let proposed: Vec<_> = self.irradiance.proposals().map(Record::from).collect();
+                Arc::get_mut(&mut set).expect("new").unite(&proposed.iter().collect::<Vec<_>>());
+                self.radiance.insert(record.order(), set);
             }
-            self.radiance.insert(order, set);
         }
         Arc::make_mut(&mut self.irradiance).unite(new.iter().copied());
         for set in self.radiance.values_mut() {
@@ -83,7 +76,6 @@ impl Level {
                 set.unite(&new);
             }
         }
-        self.shrinks.extend(new.into_iter().filter(|record| matches!(record, Record::Shrink(_))).cloned());
     }
 
     /// What a surface reflects by the records that serve it; `None` where none covers the query.
@@ -147,11 +139,6 @@ impl Level {
         self.len() == 0
     }
 
-    /// Bytes the records take in memory, all that is derived from them included.
-    pub fn bytes(&self) -> usize {
-        self.irradiance.bytes() + self.radiance.values().map(|set| set.bytes()).sum::<usize>()
-    }
-
     /// Digest of what gathers of the level above read.
     pub fn digest(&self) -> Digest {
         self.irradiance.digest()
@@ -166,8 +153,6 @@ trait Glossy: Send + Sync {
     fn copied(&self) -> Arc<dyn Glossy>;
     /// How many records.
     fn len(&self) -> usize;
-    /// Bytes they take.
-    fn bytes(&self) -> usize;
     /// Whether any record counts at a query.
     fn covers(&self, query: &Query) -> bool;
     /// The allowed error a record made at a query should begin with.
@@ -189,10 +174,6 @@ impl<const N: usize> Glossy for Sealed<Radiance<N>> {
 
     fn len(&self) -> usize {
         self.len()
-    }
-
-    fn bytes(&self) -> usize {
-        self.bytes()
     }
 
     fn covers(&self, query: &Query) -> bool {
@@ -223,14 +204,7 @@ impl<const N: usize> Glossy for Sealed<Radiance<N>> {
 }
 
 fn empty(order: usize, a: f32, details: Details) -> Option<Arc<dyn Glossy>> {
-    Some(match order {
-        2 => Arc::new(Sealed::<Radiance<4>>::with(a, details)),
-        4 => Arc::new(Sealed::<Radiance<16>>::with(a, details)),
-        6 => Arc::new(Sealed::<Radiance<36>>::with(a, details)),
-        8 => Arc::new(Sealed::<Radiance<64>>::with(a, details)),
-        10 => Arc::new(Sealed::<Radiance<100>>::with(a, details)),
-        _ => return None,
-    })
+    of_order!(order, N => Arc::new(Sealed::<Radiance<N>>::with(a, details)))
 }
 
 fn reflected<const N: usize>(answer: &radiance::Answer<N>, lobe: &Coefficients<N>) -> Reflected {

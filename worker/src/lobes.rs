@@ -10,16 +10,13 @@ use std::sync::Arc;
 
 use cache_core::hsh::COEFFICIENTS_MAX;
 use cache_core::hsh::lobe::Lobe;
-use cache_core::radiance::Coefficients;
+use cache_core::radiance::{Coefficients, ORDERS};
 use glam::Vec3;
 use smallvec::SmallVec;
 
 use crate::bsdf::Bsdf;
 use crate::scene::{Material, Rgb};
 use crate::settings::Method;
-
-/// Orders there are records of.
-pub const ORDERS: [usize; 5] = [2, 4, 6, 8, 10];
 
 /// Of the energy a surface reflects, what records may miss.
 const MISSED: f32 = 0.1;

@@ -152,11 +152,7 @@ impl Replica {
     /// What stands at a position: records of one tag and kind, as many as fit one batch, and how many those are.
     pub fn batch(&self, position: u64) -> Option<(u64, v1::RecordBatch)> {
         let rest = self.set.since(usize::try_from(position).ok()?);
-        let (tag, first) = rest.first()?;
-        let alike = |(t, record): &&(Tag, Record)| t == tag && record.kind() == first.kind();
-        let count = rest.iter().take(convert::BATCH_RECORDS_MAX).take_while(alike).count();
-        let run = rest[..count].iter().map(|(_, record)| record);
-        Some((count as u64, convert::pack(&self.namespace, *tag, run)))
+        convert::batches(&self.namespace, rest).next().map(|(count, batch)| (count as u64, batch))
     }
 
     /// Digest of the records below `position`, if they are here.

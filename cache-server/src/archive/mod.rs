@@ -139,12 +139,7 @@ impl Archive {
             }
             let mut records: Vec<_> = held(set).collect();
             records.sort_by_key(|(tag, record)| (*tag, record.kind(), record.id()));
-            for run in records.chunk_by(|a, b| (a.0, a.1.kind()) == (b.0, b.1.kind())) {
-                for batch in run.chunks(convert::batch_max(run[0].1.kind())) {
-                    let records = batch.iter().map(|(_, record)| record);
-                    each(Kind::Batch(convert::pack(namespace, batch[0].0, records)))?;
-                }
-            }
+            convert::batches(namespace, &records).try_for_each(|(_, batch)| each(Kind::Batch(batch)))?;
         }
         for (draft, namespace) in &self.publications {
             let (draft, namespace) = (draft.0.to_vec().into(), namespace.0.to_vec().into());
