@@ -216,3 +216,65 @@ fn reflected<const N: usize>(answer: &radiance::Answer<N>, lobe: &Coefficients<N
         noise: radiance::gain(lobe) * answer.noise,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use cache_core::{RecordId, Shrink};
+    use glam::Vec3;
+
+    use super::*;
+    use crate::bsdf::Bsdf;
+    use crate::lobes::Lobes;
+    use crate::scene::{Material, Surface};
+    use crate::settings::Method;
+
+    fn record(id: u128, irradiance: bool) -> Record {
+        let (position, normal) = (Vec3::ZERO, Vec3::Z);
+        let (radius, radius_min, radius_max) = (1.0, 0.01, 2.0);
+        let (id, ellipse, noise) = (RecordId(id), [0.0; 3], 0.0);
+        if irradiance {
+            let gradient = Default::default();
+            let (irradiance, gradient_t, gradient_r) = (Vec3::ONE, gradient, gradient);
+            return Irradiance {
+                id,
+                position,
+                normal,
+                radius,
+                radius_min,
+                radius_max,
+                irradiance,
+                gradient_t,
+                gradient_r,
+                ellipse,
+                noise,
+            }
+            .into();
+        }
+        let (coefficients, gradient) = ([[0.5; 16]; 3], [[[0.0; 16]; 3]; 2]);
+        Radiance { id, position, normal, radius, radius_min, radius_max, ellipse, noise, coefficients, gradient }.into()
+    }
+
+    /// In whatever order records of both kinds and proposals for them come.
+    #[test]
+    fn proposals_shrink_records_of_both_kinds_whenever_they_come() {
+        let surface = Surface::Metal { specular: 1.0, roughness: 0.3 };
+        let metal = Material { surface, ..Material::diffuse(Rgb::ONE) };
+        let bsdf = Bsdf::new(&metal, Rgb::ONE);
+        let lobes = Lobes::new(&[metal], Method::Radiance, Some(4));
+        let gloss = lobes.serve(0, &bsdf, Vec3::Z, 1).expect("it glosses");
+        let diffuse = Served::Diffuse(Rgb::ONE);
+        let at = Query::new(Vec3::X * 0.4, Vec3::Z);
+        let covered = |records: &[Record]| {
+            let mut level = Level::new(0.5, Details::default());
+            records.iter().for_each(|record| level.unite([record]));
+            [&diffuse, &gloss].map(|served| level.covers(&at, served))
+        };
+        let [flat, round] = [record(1, true), record(2, false)];
+        let less = [1, 2].map(|id| Record::from(Shrink::new(RecordId(id), 0.2)));
+        assert_eq!(covered(&[flat.clone(), round.clone()]), [true, true]);
+        assert_eq!(covered(&[flat.clone(), round.clone(), less[1].clone()]), [true, false]);
+        let [one, two] = less;
+        assert_eq!(covered(&[one.clone(), two.clone(), flat.clone(), round.clone()]), [false, false]);
+        assert_eq!(covered(&[flat, one, two, round]), [false, false]);
+    }
+}
