@@ -267,7 +267,7 @@ pub(crate) fn order_of(kind: u32) -> usize {
 pub const ORDERS: [usize; 5] = [2, 4, 6, 8, 10];
 
 /// `$work` with `$N` being the number of coefficients of an order; `None` for an order that is none of
-/// [`ORDERS`](crate::radiance::ORDERS).
+/// [`ORDERS`].
 #[macro_export]
 macro_rules! of_order {
     ($order:expr, $N:ident => $work:expr) => {
