@@ -43,6 +43,17 @@ struct Derived {
     a: f32,
 }
 
+/// How a record counts among its neighbours.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Counting {
+    /// R it counts with, world length: clamped, and within its bounds.
+    pub radius: f32,
+    /// Its allowed error a_i.
+    pub a: f32,
+    /// How much of its gradients holds, in [0, 1].
+    pub limit: f32,
+}
+
 /// What one record says at a query.
 #[derive(Clone, Debug)]
 pub struct Contribution<C: Cached> {
@@ -244,6 +255,13 @@ impl<C: Cached> Sealed<C> {
     /// The records, in the order of sums.
     pub fn records(&self) -> &[C] {
         &self.records
+    }
+
+    /// The records as they count, in the order of sums.
+    pub fn counting(&self) -> impl Iterator<Item = (&C, Counting)> {
+        self.records.iter().zip(&self.derived).enumerate().map(|(i, (record, derived))| {
+            (record, Counting { radius: derived.radius(record), a: derived.a, limit: self.limit(i) })
+        })
     }
 
     /// Bytes the records take, all that is derived from them included.

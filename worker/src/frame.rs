@@ -6,7 +6,8 @@ use cache_core::details::Spacing;
 use cache_core::hemisphere::Strata;
 use cache_core::id::Random;
 use cache_core::incoming::Bands;
-use cache_core::{Namespace, Record, RecordId, rounds};
+use cache_core::{Namespace, Query, Record, RecordId, rounds};
+use glam::Vec3;
 
 use crate::bsdf::Part;
 use crate::gather::{Gather, Rays, Site};
@@ -18,6 +19,7 @@ use crate::refine::Proposals;
 use crate::sampler::Sampler;
 use crate::scene::Scene;
 use crate::settings::{Method, Settings};
+use crate::splat::{Lost, Splat};
 use crate::task::CpuClock;
 use crate::trace::Tracer;
 use crate::world::World;
@@ -383,23 +385,85 @@ impl Frame {
 
     /// The finished pixels of `tile`, row by row, [`CHANNELS`] floats each.
     pub fn pixels(&self, tile: u32, sealed: &Levels) -> (Vec<f32>, Counts) {
-        let mut counts = Counts::default();
-        let looking = if self.settings.effort.is_some() { self.looking(sealed) } else { self.tracer(sealed) };
-        let tracer = Tracer { regather: Some(&self.strata[2]), ..looking };
-        let [x0, x1, y0, y1] = self.settings.tile(tile);
+        let (mut counts, tracer) = (Counts::default(), self.finishing(sealed));
         let mut pixels: Vec<_> = self.settings.pixels(tile).map(|[x, y]| Pixel::new(&self.settings, x, y)).collect();
-        let spp = self.settings.spp;
-        let first = if self.settings.effort.is_some() { FIRST_SAMPLES.min(spp) } else { spp };
+        let first = self.first_samples();
         pixels.iter_mut().for_each(|pixel| pixel.sample(0..first, &tracer, &self.settings, &mut counts));
-        if let Some(effort) = self.settings.effort {
-            let (width, height) = ((x1 - x0) as usize, (y1 - y0) as usize);
-            let deviations = deviations(&pixels, width, height);
-            for (pixel, deviation) in pixels.iter_mut().zip(deviations) {
-                let wanted = (deviation * effort.samples).clamp(first as f32, spp as f32) as u32;
-                pixel.sample(first..wanted, &tracer, &self.settings, &mut counts);
-            }
+        let wanted = self.wanted(tile, &pixels);
+        for (pixel, wanted) in pixels.iter_mut().zip(wanted) {
+            pixel.sample(first..wanted, &tracer, &self.settings, &mut counts);
         }
         pixels.iter().for_each(|pixel| counts.finish(pixel));
-        (pixels.iter().flat_map(|p| p.sum.map(|s| s / p.samples as f32)).collect(), counts)
+        (means(&pixels), counts)
     }
+
+    /// The same of several tiles, one after another, where `splat` answers in place of the octree: all samples of one number at a
+    /// time.
+    ///
+    /// # Errors
+    /// Those of `splat`.
+    pub fn splatted(
+        &self,
+        tiles: Range<u32>,
+        sealed: &Levels,
+        splat: &mut dyn Splat,
+    ) -> Result<(Vec<Vec<f32>>, Counts), Lost> {
+        let (mut counts, tracer) = (Counts::default(), self.finishing(sealed));
+        let new = |tile| self.settings.pixels(tile).map(|[x, y]| Pixel::new(&self.settings, x, y)).collect();
+        let mut done: Vec<Vec<Pixel>> = tiles.clone().map(new).collect();
+        let first = self.first_samples();
+        let mut wanted: Vec<u32> = done.iter().flatten().map(|_| first).collect();
+        let mut index = 0;
+        while index < wanted.iter().copied().max().unwrap_or(0) {
+            let look = |(pixel, wanted): (&Pixel, &u32)| {
+                if index < *wanted { pixel.look(index, &tracer, &self.settings, &mut counts) } else { None }
+            };
+            let looks: Vec<_> = done.iter().flatten().zip(&wanted).map(look).collect();
+            let mut answers = splat.answers(&mut looks.iter().flatten())?.into_iter();
+            for ((pixel, wanted), look) in done.iter_mut().flatten().zip(&wanted).zip(&looks) {
+                if index < *wanted {
+                    let told = look.as_ref().and_then(|_| answers.next().flatten());
+                    pixel.sample_told(index, told, &tracer, &self.settings, &mut counts);
+                }
+            }
+            index += 1;
+            if index == first {
+                wanted = tiles.clone().zip(&done).flat_map(|(tile, pixels)| self.wanted(tile, pixels)).collect();
+            }
+        }
+        done.iter().flatten().for_each(|pixel| counts.finish(pixel));
+        Ok((done.iter().map(|pixels| means(pixels)).collect(), counts))
+    }
+
+    /// Where the first surface along a ray from the camera asks records, and which.
+    pub fn look(&self, ray: (Vec3, Vec3), counts: &mut Counts) -> Option<(Query, Served<'_>)> {
+        static NONE: Levels = Levels::new();
+        self.tracer(&NONE).look(ray, counts)
+    }
+
+    fn finishing<'a>(&'a self, sealed: &'a Levels) -> Tracer<'a> {
+        let looking = if self.settings.effort.is_some() { self.looking(sealed) } else { self.tracer(sealed) };
+        Tracer { regather: Some(&self.strata[2]), ..looking }
+    }
+
+    /// Samples every pixel of a picture has.
+    fn first_samples(&self) -> u32 {
+        let spp = self.settings.spp;
+        if self.settings.effort.is_some() { FIRST_SAMPLES.min(spp) } else { spp }
+    }
+
+    /// How many samples each pixel of a tile should have, by what the first ones scatter.
+    fn wanted(&self, tile: u32, pixels: &[Pixel]) -> Vec<u32> {
+        let (first, spp) = (self.first_samples(), self.settings.spp);
+        let Some(effort) = self.settings.effort else { return vec![spp; pixels.len()] };
+        let [x0, x1, y0, y1] = self.settings.tile(tile);
+        let deviations = deviations(pixels, (x1 - x0) as usize, (y1 - y0) as usize);
+        let wanted = |deviation: f32| (deviation * effort.samples).clamp(first as f32, spp as f32) as u32;
+        deviations.into_iter().map(wanted).collect()
+    }
+}
+
+/// Means of finished pixels, [`CHANNELS`] floats each.
+fn means(pixels: &[Pixel]) -> Vec<f32> {
+    pixels.iter().flat_map(|p| p.sum.map(|s| s / p.samples as f32)).collect()
 }

@@ -7,9 +7,10 @@ use std::sync::Arc;
 use cache_core::details::Details;
 use cache_core::id::Digest;
 use cache_core::radiance::{self, Coefficients};
-use cache_core::sealed::Contribution;
+use cache_core::sealed::{Contribution, Counting};
 use cache_core::shrink::Share;
-use cache_core::{Irradiance, Query, Radiance, Record, Sealed, of_order};
+use cache_core::{Irradiance, Query, Radiance, Record, RecordId, Sealed, of_order};
+use glam::Vec3;
 use smallvec::SmallVec;
 
 use crate::lobes::{Reflection, Served};
@@ -42,6 +43,27 @@ pub struct Reflected {
     /// Standard error of the radiance for the records' noise, root mean square over the channels, W/(sr m²).
     pub noise: f32,
 }
+
+/// A record as it counts in its level: what a splat is made of.
+pub struct CountingRecord<'r> {
+    /// Identity.
+    pub id: RecordId,
+    /// Site, world.
+    pub position: Vec3,
+    /// Unit normal.
+    pub normal: Vec3,
+    /// How it counts.
+    pub counting: Counting,
+    /// (xx, xy, yy) of M, 1/m².
+    pub ellipse: [f32; 3],
+    /// Standard error of its value.
+    pub noise: f32,
+    /// E, ∇_t E and ∇_r E channel by channel; or Λ, ∂Λ/∂x and ∂Λ/∂y, each channel by channel.
+    pub values: &'r [f32],
+}
+
+/// Values of a record of irradiance.
+pub const IRRADIANCE_VALUES: usize = 15;
 
 impl Level {
     /// An empty one whose records will count with the allowed error `a`.
@@ -129,6 +151,31 @@ impl Level {
         }
     }
 
+    /// Orders of its records of radiance.
+    pub fn orders(&self) -> impl Iterator<Item = usize> {
+        self.radiance.keys().copied()
+    }
+
+    /// Tells of every record of irradiance, or of radiance of an order, in the order of sums.
+    pub fn counting(&self, order: Option<usize>, tell: &mut dyn FnMut(CountingRecord)) {
+        match order {
+            None => {
+                for (r, counting) in self.irradiance.counting() {
+                    let mut values = [0.0; IRRADIANCE_VALUES];
+                    let pairs = r.gradient_t.iter().chain(&r.gradient_r).flat_map(|pair| pair.to_array());
+                    values.iter_mut().zip(r.irradiance.to_array().into_iter().chain(pairs)).for_each(|(to, v)| *to = v);
+                    let (id, position, normal, ellipse, noise) = (r.id, r.position, r.normal, r.ellipse, r.noise);
+                    tell(CountingRecord { id, position, normal, counting, ellipse, noise, values: &values });
+                }
+            }
+            Some(order) => {
+                if let Some(set) = self.radiance.get(&order) {
+                    set.counting(tell);
+                }
+            }
+        }
+    }
+
     /// Records of all kinds.
     pub fn len(&self) -> usize {
         self.irradiance.len() + self.radiance.values().map(|set| set.len()).sum::<usize>()
@@ -151,6 +198,8 @@ trait Glossy: Send + Sync {
     fn unite(&mut self, new: &[&Record]);
     /// The same set again.
     fn copied(&self) -> Arc<dyn Glossy>;
+    /// Tells of every record.
+    fn counting(&self, tell: &mut dyn FnMut(CountingRecord));
     /// How many records.
     fn len(&self) -> usize;
     /// Whether any record counts at a query.
@@ -170,6 +219,17 @@ impl<const N: usize> Glossy for Sealed<Radiance<N>> {
 
     fn copied(&self) -> Arc<dyn Glossy> {
         Arc::new(self.clone())
+    }
+
+    fn counting(&self, tell: &mut dyn FnMut(CountingRecord)) {
+        let mut values = Vec::with_capacity(9 * N);
+        for (r, counting) in self.counting() {
+            values.clear();
+            values.extend_from_slice(r.coefficients.as_flattened());
+            values.extend_from_slice(r.gradient.as_flattened().as_flattened());
+            let (id, position, normal, ellipse, noise) = (r.id, r.position, r.normal, r.ellipse, r.noise);
+            tell(CountingRecord { id, position, normal, counting, ellipse, noise, values: &values });
+        }
     }
 
     fn len(&self) -> usize {
@@ -219,8 +279,7 @@ fn reflected<const N: usize>(answer: &radiance::Answer<N>, lobe: &Coefficients<N
 
 #[cfg(test)]
 mod tests {
-    use cache_core::{RecordId, Shrink};
-    use glam::Vec3;
+    use cache_core::Shrink;
 
     use super::*;
     use crate::bsdf::Bsdf;

@@ -17,6 +17,7 @@
 //! - [`pixel`]: one pixel as its samples come in.
 //! - [`refine`]: where records make visible steps, and how far they should shrink for that.
 //! - [`frame`]: the two kinds of work a worker leases: filling rounds and making pixels.
+//! - [`splat`]: answers from elsewhere than the octree.
 //! - [`pilot`]: settings from an error.
 //! - [`solo`]: a frame without a farm.
 //! - [`spec`]: settings on the wire.
@@ -56,6 +57,7 @@ pub mod pixel;
 pub mod refine;
 
 pub mod frame;
+pub mod splat;
 
 pub mod pilot;
 pub mod solo;

@@ -4,11 +4,14 @@ use std::ops::Range;
 
 use cache_core::Rgb;
 use cache_core::id::Random;
+use glam::Vec3;
 
 use crate::frame::{CHANNELS, Counts};
+use crate::levels::Reflected;
 use crate::sampler::Sampler;
 use crate::settings::Settings;
-use crate::trace::{Chance, Tracer};
+use crate::splat::Look;
+use crate::trace::{Chance, Seen, Tracer};
 
 /// What Sobol points leave of the variance that as many random points would have, four of them; more leave less. Fitted to
 /// the errors met with 4 to 64 samples on cornell, stairs and glossy-floor.
@@ -51,21 +54,56 @@ impl Pixel {
     /// Takes samples of these numbers.
     pub fn sample(&mut self, numbers: Range<u32>, tracer: &Tracer, settings: &Settings, counts: &mut Counts) {
         for index in numbers {
-            let mut sampler = Sampler::pixel(index, self.seed);
-            let [u, v, ..] = sampler.next4();
-            let ray = settings.ray(self.x as f32 + u, self.y as f32 + v);
+            let (ray, mut sampler) = self.ray(index, settings);
             let seen = tracer.see(ray, 1, Chance::All, &mut sampler, counts);
-            let total = seen.total();
-            let layers = [total, seen.direct, seen.indirect, seen.irradiance];
-            let floats = layers.iter().flat_map(|l| l.to_array()).chain([seen.records as f32]);
-            self.sum.iter_mut().zip(floats).for_each(|(sum, value)| *sum += value);
-            let reflected = total - seen.emission;
-            self.reflected += reflected;
-            self.squares += reflected * reflected;
-            self.sees_light |= seen.emission != Rgb::ZERO;
-            self.noise += seen.noise;
-            self.samples += 1;
+            self.add(&seen);
         }
+    }
+
+    /// The ray of a sample, and the random numbers that are left.
+    fn ray(&self, index: u32, settings: &Settings) -> ((Vec3, Vec3), Sampler) {
+        let mut sampler = Sampler::pixel(index, self.seed);
+        let [u, v, ..] = sampler.next4();
+        (settings.ray(self.x as f32 + u, self.y as f32 + v), sampler)
+    }
+
+    /// Where a sample asks records, and which; `None`: nowhere.
+    pub fn look<'a>(
+        &self,
+        index: u32,
+        tracer: &'a Tracer,
+        settings: &Settings,
+        counts: &mut Counts,
+    ) -> Option<Look<'a>> {
+        let (query, served) = tracer.look(self.ray(index, settings).0, counts)?;
+        Some(Look { pixel: [self.x, self.y], query, served })
+    }
+
+    /// Takes the sample of a number whose [`Self::look`] was answered elsewhere.
+    pub fn sample_told(
+        &mut self,
+        index: u32,
+        told: Option<Reflected>,
+        tracer: &Tracer,
+        settings: &Settings,
+        counts: &mut Counts,
+    ) {
+        let (ray, mut sampler) = self.ray(index, settings);
+        let seen = tracer.see_told(ray, told, &mut sampler, counts);
+        self.add(&seen);
+    }
+
+    fn add(&mut self, seen: &Seen) {
+        let total = seen.total();
+        let layers = [total, seen.direct, seen.indirect, seen.irradiance];
+        let floats = layers.iter().flat_map(|l| l.to_array()).chain([seen.records as f32]);
+        self.sum.iter_mut().zip(floats).for_each(|(sum, value)| *sum += value);
+        let reflected = total - seen.emission;
+        self.reflected += reflected;
+        self.squares += reflected * reflected;
+        self.sees_light |= seen.emission != Rgb::ZERO;
+        self.noise += seen.noise;
+        self.samples += 1;
     }
 
     /// Mean radiance, W/(sr m²).

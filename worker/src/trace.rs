@@ -8,6 +8,7 @@
 
 use std::f32::consts::FRAC_1_PI;
 
+use cache_core::Query;
 use cache_core::hemisphere::{Cells, Sample, Strata, irradiance};
 use cache_core::id::Random;
 use glam::{Vec2, Vec3};
@@ -89,13 +90,45 @@ pub struct Seen {
     pub distance: f32,
 }
 
-impl Tracer<'_> {
+impl<'a> Tracer<'a> {
     /// Follows a ray whose first surface has depth `first`.
     pub fn see(
+        &self,
+        ray: (Vec3, Vec3),
+        first: u32,
+        chance: Chance,
+        sampler: &mut Sampler,
+        counts: &mut Counts,
+    ) -> Seen {
+        self.follow(ray, first, chance, None, sampler, counts)
+    }
+
+    /// Follows a ray from the camera where others have asked what records tell of its first surface, as [`Self::look`] found it.
+    pub fn see_told(
+        &self,
+        ray: (Vec3, Vec3),
+        told: Option<Reflected>,
+        sampler: &mut Sampler,
+        counts: &mut Counts,
+    ) -> Seen {
+        self.follow(ray, 1, Chance::All, Some(told), sampler, counts)
+    }
+
+    /// Where the first surface along a ray from the camera asks records, and which; `None`: nowhere.
+    pub fn look(&self, (origin, direction): (Vec3, Vec3), counts: &mut Counts) -> Option<(Query, Served<'a>)> {
+        counts.path_rays += 1;
+        let at = self.world.meet(origin, direction)?;
+        let bsdf = self.world.bsdf(&at)?;
+        let served = self.served(&at, &bsdf, at.frame.to_local(-direction), 1)?;
+        Some((at.query(), served))
+    }
+
+    fn follow(
         &self,
         (mut origin, mut direction): (Vec3, Vec3),
         first: u32,
         mut chance: Chance,
+        mut told: Option<Option<Reflected>>,
         sampler: &mut Sampler,
         counts: &mut Counts,
     ) -> Seen {
@@ -127,7 +160,14 @@ impl Tracer<'_> {
             let outgoing = at.frame.to_local(-direction);
             let four = sampler.next4();
             let served = self.served(&at, &bsdf, outgoing, depth);
-            let answer = served.as_ref().and_then(|served| self.answer(&at, served, depth, sampler, counts));
+            let told = told.take();
+            let answer = served.as_ref().and_then(|served| match told {
+                Some(told) => {
+                    counts.queries += 1;
+                    told.or_else(|| self.missed(&at, served, depth, sampler, counts))
+                }
+                None => self.answer(&at, served, depth, sampler, counts),
+            });
             let alone = answer.is_some() && matches!(served, Some(Served::Gloss(..)));
             let part = match answer {
                 Some(answer) => {
@@ -174,7 +214,7 @@ impl Tracer<'_> {
     }
 
     /// Which records serve a surface met at a depth; `None`: those of none.
-    pub fn served(&self, at: &Meeting, bsdf: &Bsdf, outgoing: Vec3, depth: u32) -> Option<Served<'_>> {
+    pub fn served(&self, at: &Meeting, bsdf: &Bsdf, outgoing: Vec3, depth: u32) -> Option<Served<'a>> {
         if !self.cached || !self.world.cached(at) {
             return None;
         }
@@ -196,10 +236,18 @@ impl Tracer<'_> {
             return nothing_left.then(Reflected::default);
         };
         counts.queries += 1;
-        let answer = level.ask(&at.query(), served);
-        if answer.is_some() {
-            return answer;
-        }
+        level.ask(&at.query(), served).or_else(|| self.missed(at, served, depth, sampler, counts))
+    }
+
+    /// A small gather in the place of records that do not cover a point; `None`: follow the path.
+    fn missed(
+        &self,
+        at: &Meeting,
+        served: &Served,
+        depth: u32,
+        sampler: &mut Sampler,
+        counts: &mut Counts,
+    ) -> Option<Reflected> {
         counts.misses += 1;
         let Served::Diffuse(albedo) = served else { return None };
         counts.regathers += u64::from(self.regather.is_some());

@@ -19,7 +19,7 @@ pub const TURN_MAX: f32 = 0.8;
 const CHORD_MAX: f32 = TURN_MAX * std::f32::consts::SQRT_2;
 
 /// Tabulated tilts, beside none at all: denser at small ones, where harmonics steep at the horizon make entries bend.
-const STEPS: usize = 48;
+pub const STEPS: usize = 48;
 
 /// Nodes of the rule a tilt is integrated by, along each piece of the hemisphere that no edge crosses.
 const NODES: usize = 24;
@@ -72,6 +72,21 @@ pub fn turn<const N: usize>(coefficients: &mut [f32; N], angle: Vec2) {
         }
         multiple = angle.rotate(multiple);
     }
+}
+
+/// The tilts of an order as others may interpolate them: at chord c the cubic through the four steps round
+/// √(c / (√2 [`TURN_MAX`])) ([`STEPS`]).
+pub struct Table {
+    /// Coefficients with m ≥ 0, then those with m < 0: which each row and column of a matrix is.
+    pub index: [&'static [usize]; 2],
+    /// For each of both, the matrices of all steps 0..=[`STEPS`], each column by column.
+    pub matrices: [&'static [f32]; 2],
+}
+
+/// The tilts of records of `N` coefficients.
+pub fn table<const N: usize>() -> Table {
+    let Tilts { even, odd } = tilts::<N>();
+    Table { index: [&even.index, &odd.index], matrices: [&even.matrices, &odd.matrices] }
 }
 
 /// Tilts of one order. What is even in y (m ≥ 0) and what is odd (m < 0) stay apart.
