@@ -45,6 +45,7 @@ pub mod lamps;
 pub mod lookups;
 pub mod rays;
 pub mod soups;
+pub mod splat;
 pub mod start;
 
 pub mod bare;

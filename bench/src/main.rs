@@ -3,7 +3,7 @@
 use std::error::Error;
 
 use ambience_bench::host::HostArgs;
-use ambience_bench::{asked, details, farm, gloss, host, lamps, lookups, peers, pictures, rays, service, start};
+use ambience_bench::{asked, details, farm, gloss, host, lamps, lookups, peers, pictures, rays, service, splat, start};
 use clap::{Parser, Subcommand};
 
 /// Speed against accuracy: every method at several settings, on the scenes with references.
@@ -29,6 +29,8 @@ enum Command {
     Rays(rays::RaysArgs),
     /// Look-ups a second, against an octree of pointers
     Lookups(lookups::LookupsArgs),
+    /// Records splat by a graphics adapter, against the octree with all cores
+    Splat(splat::SplatArgs),
     /// A thousand lamps against one
     Lamps(lamps::LampsArgs),
     /// Radiance, Mitsuba, and Mitsuba with Open Image Denoise, on the same scenes
@@ -53,6 +55,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         Some(Command::Gloss(args)) => gloss::run(&args),
         Some(Command::Rays(args)) => rays::run(&args),
         Some(Command::Lookups(args)) => lookups::run(&args),
+        Some(Command::Splat(args)) => splat::run(&args),
         Some(Command::Lamps(args)) => lamps::run(&args),
         Some(Command::Peers(args)) => peers::run(&args),
         Some(Command::Start(args)) => start::run(&args),

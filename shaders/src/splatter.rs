@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::f32::consts::FRAC_1_PI;
 use std::sync::Arc;
+use std::time::Instant;
 
 use cache_core::{of_order, radiance};
 use glam::Vec3;
@@ -31,6 +32,7 @@ pub struct Splatter {
     region: Option<Region>,
     /// Bytes one buffer may have.
     most: u64,
+    device_seconds: f64,
 }
 
 /// Records of one kind.
@@ -69,13 +71,26 @@ impl Splatter {
     /// One for a picture, without records.
     pub fn new(gpu: Arc<Gpu>, settings: &Settings) -> Self {
         let (normalise, most) = (passes::normalise(&gpu), gpu.binding_max());
-        Self { gpu, settings: settings.clone(), kinds: BTreeMap::new(), normalise, region: None, most }
+        Self {
+            gpu,
+            settings: settings.clone(),
+            kinds: BTreeMap::new(),
+            normalise,
+            region: None,
+            most,
+            device_seconds: 0.0,
+        }
     }
 
     /// The same with buffers of at most so many bytes.
     #[must_use]
     pub fn with_buffers_of(self, most: u64) -> Self {
         Self { most, ..self }
+    }
+
+    /// Seconds the device worked on the last answers.
+    pub fn device_seconds(&self) -> f64 {
+        self.device_seconds
     }
 
     /// Takes the records of a level in place of those it has.
@@ -161,7 +176,9 @@ impl Splatter {
         encoder.copy_buffer_to_buffer(&region.answers, 0, &region.read, 0, region.read.size());
         gpu.queue.submit([encoder.finish()]);
         region.read.map_async(wgpu::MapMode::Read, .., |_| {});
+        let start = Instant::now();
         gpu.wait()?;
+        self.device_seconds += start.elapsed().as_secs_f64();
         let mapped = region.read.get_mapped_range(..).map_err(|e| Lost(format!("{}: {e}", gpu.name)))?;
         let answers = bytemuck::pod_collect_to_vec(&mapped[..]);
         drop(mapped);
@@ -290,6 +307,7 @@ impl Region {
 
 impl Splat for Splatter {
     fn answers(&mut self, looks: &mut dyn Iterator<Item = &Look>) -> Result<Vec<Option<Reflected>>, Lost> {
+        self.device_seconds = 0.0;
         let looks: Vec<&Look> = looks.collect();
         let mut answers = vec![None; looks.len()];
         let [mut columns, mut rows] = [(u32::MAX, 0); 2];

@@ -60,7 +60,8 @@ struct Frame {
 
 // Duff et al. 2017, as cache_core::math::Frame.
 fn frame(n: vec3f) -> Frame {
-    let s = select(-1.0, 1.0, n.z >= 0.0);
+    // The sign of -0 counts.
+    let s = select(1.0, -1.0, (bitcast<u32>(n.z) >> 31u) == 1u);
     let a = -1.0 / (s + n.z);
     let b = n.x * n.y * a;
     return Frame(vec3f(1.0 + s * n.x * n.x * a, s * b, -s * n.x), vec3f(b, s + n.y * n.y * a, -n.y));
