@@ -35,9 +35,6 @@ const CONNECTIONS: usize = 8;
 /// Most relays between a worker and the server.
 const DEPTH_MAX: usize = 8;
 
-/// Pause before a server above that is away is asked again what it is.
-const ASK_AGAIN: Duration = Duration::from_secs(1);
-
 /// Arguments that make a server a relay.
 #[derive(Clone, Debug, clap::Args)]
 pub struct RelayArgs {
@@ -125,27 +122,22 @@ impl Above {
 
     /// Returns only when the server above cannot be served for: what is wrong with it.
     async fn unfit(&self) -> Failure {
-        let wrong = |what: String| Failure::usage(format!("--upstream {}: {what}", self.address));
-        loop {
+        let info = || async {
             let line = client::over(self.channel(), self.credentials.bearer().passing(&self.name));
-            match client::cache(line).info(v1::InfoRequest {}).await.map(Response::into_inner) {
-                Ok(info) if info.version == VERSION => break,
-                Ok(info) => {
-                    return wrong(format!(
-                        "is version {}, this is version {VERSION}; they must be the same",
-                        info.version
-                    ));
-                }
-                Err(status) if client::is_passing(&status) => tokio::time::sleep(ASK_AGAIN).await,
-                Err(status) if status.code() == Code::FailedPrecondition => return wrong(status.message().into()),
-                // It answers those who show a token.
-                Err(status) => {
-                    tracing::debug!("{status}");
-                    break;
-                }
+            client::cache(line).info(v1::InfoRequest {}).await
+        };
+        let wrong = match client::retry_for(Duration::MAX, info).await {
+            Ok(info) if info.version != VERSION => {
+                format!("is version {}, this is version {VERSION}; they must be the same", info.version)
             }
-        }
-        std::future::pending().await
+            // It is this relay itself, not to be trusted, or no server of ours.
+            Err(status) if matches!(status.code(), Code::FailedPrecondition | Code::Unimplemented) => {
+                status.message().into()
+            }
+            // It may answer only those who show a token.
+            _ => std::future::pending().await,
+        };
+        Failure::usage(format!("--upstream {}: {wrong}", self.address))
     }
 }
 

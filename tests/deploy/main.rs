@@ -19,7 +19,8 @@ type Test = (&'static str, Result<Box<dyn FnOnce() + Send>, String>);
 
 fn main() {
     let arguments = Arguments::from_args();
-    let trials = [openjd::test(), slurm::test(), systemd::test()].map(|(name, test): Test| match test {
+    let [preempted, lost] = slurm::tests();
+    let trials = [openjd::test(), preempted, lost, systemd::test()].map(|(name, test): Test| match test {
         Ok(run) => Trial::test(name, move || {
             let ran = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run));
             ran.map_err(|panic| {

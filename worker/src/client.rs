@@ -205,20 +205,17 @@ pub fn is_passing(status: &Status) -> bool {
         || matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled | Code::DeadlineExceeded)
 }
 
-/// Why a server's certificate was not accepted, if that is what a call failed for: repeating it would not mend that.
-fn distrust(status: &Status) -> Option<Status> {
+/// Why a server cannot be called as it was, if that is what a call failed for: repeating it would not mend that.
+fn estranged(status: &Status) -> Option<Status> {
     let tls = chain(status)
         .filter_map(|error| error.downcast_ref::<io::Error>())
         .find(|error| error.kind() == io::ErrorKind::InvalidData);
-    tls.map(|error| Status::failed_precondition(format!("no trust in the encrypted connection: {error}")))
-}
-
-/// What a server that encrypts answers to a client that does not is no HTTP/2, and nobody would know why.
-fn explained(status: Status) -> Status {
-    if status.code() != Code::Internal || !status.message().starts_with("h2 protocol error") {
-        return status;
+    if let Some(error) = tls {
+        return Some(Status::failed_precondition(format!("no trust in the encrypted connection: {error}")));
     }
-    Status::internal(format!("{}; if the server encrypts, give --tls-ca", status.message()))
+    // What HTTP/2 reads in the answer of a server that encrypts.
+    let garbled = chain(status).any(|error| error.to_string().ends_with("frame with invalid size"));
+    garbled.then(|| Status::failed_precondition("does not answer in HTTP/2; if it encrypts, give --tls-ca"))
 }
 
 /// The innermost reason of an error; those around it say less.
@@ -274,9 +271,9 @@ where
         let answer = tokio::time::timeout(ATTEMPT, call()).await;
         let status = match answer {
             Ok(Ok(response)) => return Ok(response.into_inner()),
-            Ok(Err(status)) if !is_passing(&status) => return Err(explained(status)),
-            Ok(Err(status)) => match distrust(&status) {
-                Some(distrust) => return Err(distrust),
+            Ok(Err(status)) => match estranged(&status) {
+                Some(estranged) => return Err(estranged),
+                None if !is_passing(&status) => return Err(status),
                 None => status,
             },
             Err(_) => Status::deadline_exceeded(format!("no answer within {} s", ATTEMPT.as_secs())),

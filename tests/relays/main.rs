@@ -1,5 +1,7 @@
 //! Relays between workers and the server: the same picture, byte by byte, whatever tree they make and whatever befalls it.
 
+mod access;
+#[path = "../processes/mod.rs"]
 mod processes;
 
 use std::os::unix::fs::symlink;
