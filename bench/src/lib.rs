@@ -21,6 +21,7 @@
 //! - [`bare`]: the cache service with nothing behind it.
 //! - [`host`]: a server in a process of its own.
 //! - [`service`]: records in and out, queries and latency, as ratios to the bare stream.
+//! - [`splat`]: records drawn by a graphics adapter, against the octree.
 //! - [`work`]: what a simulated worker computes.
 //! - [`farm`]: one frame by farms of many sizes.
 //! - [`report`]: tables and charts.

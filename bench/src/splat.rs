@@ -4,12 +4,13 @@ use std::error::Error;
 use std::sync::Arc;
 use std::time::Instant;
 
+use cache_core::details::{Details, Spacing};
 use rayon::prelude::*;
 use shaders::device::Gpu;
 use shaders::layout::Splats;
 use shaders::splatter::Splatter;
 use worker::frame::{Counts, Frame};
-use worker::levels::Reflected;
+use worker::levels::{Level, Reflected};
 use worker::settings::Settings;
 use worker::solo::{self, Order};
 use worker::splat::{Look, Splat as _};
@@ -49,8 +50,7 @@ pub fn run(args: &SplatArgs) -> Result<(), Box<dyn Error>> {
     );
     for &count in &args.records {
         for [width, height] in SIZES {
-            let frame = frame(width, height, count);
-            let level = solo::fill(&frame, Order::Rounds).remove(0);
+            let (frame, level) = filled(width, height, count);
             let looks = looks(&frame);
             let mut splatter = Splatter::new(gpu.clone(), frame.settings());
             splatter.take(Splats::of(&level));
@@ -81,19 +81,22 @@ pub fn run(args: &SplatArgs) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// A frame that some `count` records fill, gathered with few rays.
-fn frame(width: u32, height: u32, count: usize) -> Frame {
-    let (scene, camera) = load("stairs.glb");
-    let base = Settings {
-        width,
-        height,
-        rays: 16,
-        bounces: 1,
-        ..settings(camera.with_aspect(width as f32 / height as f32), "one")
-    };
-    // Records are as many as reaches are small: twice as many at an a less by a square root of two.
-    let a = 0.3 * (4_000.0 / count as f32).sqrt();
-    Frame::new(scene, Settings { a, ..base })
+/// A frame that some `count` records fill, gathered with few rays, and these.
+fn filled(width: u32, height: u32, count: usize) -> (Frame, Level) {
+    let mut a = 0.3;
+    loop {
+        let (scene, camera) = load("stairs.glb");
+        let base = settings(camera.with_aspect(width as f32 / height as f32), "one");
+        let details = Details { spacing: Spacing::Free, ..Details::default() };
+        let frame = Frame::new(scene, Settings { width, height, a, rays: 16, bounces: 1, details, ..base });
+        let level = solo::fill(&frame, Order::Rounds).remove(0);
+        let ratio = level.len() as f32 / count as f32;
+        if (0.8..1.25).contains(&ratio) {
+            return (frame, level);
+        }
+        // Records are as many as reaches are small.
+        a *= ratio.sqrt();
+    }
 }
 
 /// Where the middles of pixels ask.
