@@ -5,29 +5,24 @@ use std::path::{Path, PathBuf};
 use cache_core::details::Details;
 use worker::client::Address;
 use worker::credentials::{CredentialArgs, Credentials};
-use worker::scene::{self, Camera, Scene};
+use worker::scene::Scene;
 use worker::settings::{ALL_BOUNCES, Method, Settings, defaults};
 use worker::{film, pilot, spec};
 
 use crate::children::Transport;
 use crate::failure::Failure;
 use crate::progress::Told;
+use crate::splat;
+use crate::view::ViewArgs;
 
 /// Renders a picture.
 #[derive(Clone, Debug, clap::Args)]
 pub struct RenderArgs {
-    /// Scene file: .glb, .gltf or .rad
-    pub scene: PathBuf,
+    #[command(flatten)]
+    pub view: ViewArgs,
     /// Picture to write; a .png to look at is written beside it
     #[arg(short, long, value_name = "OUT.exr")]
     pub output: PathBuf,
-    /// Size in pixels [default: 512 high, as wide as the camera's aspect]. Another aspect than the camera's keeps the
-    /// vertical field of view
-    #[arg(long, value_name = "WxH", value_parser = size)]
-    pub size: Option<[u32; 2]>,
-    /// Camera of the scene by name, or a Radiance view file [default: the scene's first; SCENE.vf for SCENE.rad]
-    #[arg(long, value_name = "NAME | FILE.vf")]
-    pub camera: Option<String>,
     /// Samples a pixel
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536),
           default_value_t = defaults::SPP)]
@@ -77,6 +72,10 @@ pub struct RenderArgs {
     /// the picture is looked at first, and what it shows decides
     #[arg(long, value_name = "E", value_parser = error, conflicts_with_all = ["a", "rays", "spp"])]
     pub error: Option<f32>,
+    /// Let a GPU interpolate the pixels: that of the first worker started here, or of workers of --server that splat. The same
+    /// picture within roundings, not the same bits
+    #[arg(long)]
+    pub splat: bool,
     /// How own workers reach their server.
     #[arg(long, hide = true, value_enum, default_value_t)]
     pub transport: Transport,
@@ -88,6 +87,9 @@ impl RenderArgs {
     /// # Errors
     /// [`Failure::Usage`].
     pub fn check(&self) -> Result<(), Failure> {
+        if self.splat && self.workers() > 0 {
+            splat::check("--splat")?;
+        }
         if let Some(cache) = self.cache.as_ref().filter(|cache| cache.exists() && !cache.is_dir()) {
             return Err(Failure::usage(format!("--cache {}: expected a directory", cache.display())));
         }
@@ -98,7 +100,7 @@ impl RenderArgs {
         if !ending {
             return Err(Failure::usage(format!("--output {}: expected a name ending in .exr", self.output.display())));
         }
-        let mut taken = vec![identity(&self.scene)];
+        let mut taken = vec![identity(&self.view.scene)];
         for (path, option) in
             [(Some(&self.output), "--output"), (Some(&self.png()), "--output"), (self.stats.as_ref(), "--stats")]
         {
@@ -141,14 +143,9 @@ impl RenderArgs {
     /// # Errors
     /// [`Failure::Usage`]: no such camera, or a value outside its range.
     pub fn settings(&self, scene: &Scene) -> Result<Settings, Failure> {
-        let camera = self.find_camera(scene)?;
-        let [width, height] = self.size.unwrap_or_else(|| {
-            let width = (defaults::HEIGHT as f32 * camera.aspect()).round().clamp(1.0, 65536.0);
-            [width as u32, defaults::HEIGHT]
-        });
+        let (camera, [width, height]) = self.view.of(scene)?;
         let settings = Settings {
-            // The default size is the camera's own aspect but for rounding; what is inside the picture follows its size.
-            camera: camera.with_aspect(width as f32 / height as f32),
+            camera,
             width,
             height,
             spp: self.spp,
@@ -164,27 +161,6 @@ impl RenderArgs {
         spec::check(&settings).map_err(|e| Failure::usage(format!("--{e}")))?;
         Ok(settings)
     }
-
-    fn find_camera(&self, scene: &Scene) -> Result<Camera, Failure> {
-        let view = |path: &Path| scene::load_view(path).map_err(Failure::usage);
-        if let Some(name) = &self.camera {
-            if Path::new(name).extension().is_some_and(|e| e.eq_ignore_ascii_case("vf")) {
-                return view(name.as_ref());
-            }
-            let named = scene.cameras.iter().find(|c| c.name == *name).cloned();
-            return named.ok_or_else(|| {
-                Failure::usage(format!("--camera {name}: {} has {}", self.scene.display(), cameras(scene)))
-            });
-        }
-        let beside = self.scene.with_extension("vf");
-        if self.scene.extension().is_some_and(|e| e.eq_ignore_ascii_case("rad")) && beside.is_file() {
-            return view(&beside);
-        }
-        scene.cameras.first().cloned().ok_or_else(|| {
-            let scene = self.scene.display();
-            Failure::usage(format!("{scene} has no camera: name a view file with --camera FILE.vf"))
-        })
-    }
 }
 
 /// The same for all names of one file, which need not be there yet.
@@ -194,20 +170,6 @@ fn identity(path: &Path) -> PathBuf {
         (Some(Ok(folder)), Some(name)) => folder.join(name),
         _ => path.to_path_buf(),
     })
-}
-
-/// The cameras there are, in words.
-fn cameras(scene: &Scene) -> String {
-    let names: Vec<_> = scene.cameras.iter().map(|c| format!("{:?}", c.name)).collect();
-    if names.is_empty() { "no cameras".into() } else { format!("the cameras {}", names.join(", ")) }
-}
-
-fn size(text: &str) -> Result<[u32; 2], String> {
-    let parsed = text.split_once(['x', 'X']).and_then(|(w, h)| Some([w.parse().ok()?, h.parse().ok()?]));
-    match parsed {
-        Some([w, h]) if (1..=65536).contains(&w) && (1..=65536).contains(&h) => Ok([w, h]),
-        _ => Err("expected WIDTHxHEIGHT in pixels, each 1 to 65536".into()),
-    }
 }
 
 fn allowed_error(text: &str) -> Result<f32, String> {
@@ -232,6 +194,8 @@ fn bounces(text: &str) -> Result<u32, String> {
 mod tests {
     use clap::Parser;
     use glam::Vec3;
+
+    use worker::scene::Camera;
 
     use super::*;
 
@@ -296,9 +260,6 @@ mod tests {
         let mut other = args(&[]);
         other.output = "out.png".into();
         assert_eq!(usage(other.check()), "--output out.png: expected a name ending in .exr");
-        for wrong in ["0x5", "5", "axb", "5x70000", "5x"] {
-            assert!(size(wrong).is_err());
-        }
         for wrong in
             [["--spp", "0"], ["--a", "nan"], ["--a", "0"], ["--rays", "3"], ["--threads", "0"], ["--spp", "70000"]]
         {

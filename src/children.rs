@@ -143,12 +143,20 @@ impl Children {
     ///
     /// # Errors
     /// When it cannot be started.
-    pub fn start_worker(&mut self, server: &Address, credentials: &Credentials, threads: u16) -> Result<(), Failure> {
+    pub fn start_worker(
+        &mut self,
+        server: &Address,
+        credentials: &Credentials,
+        threads: u16,
+        splat: bool,
+    ) -> Result<(), Failure> {
         self.started += 1;
         let (name, title) = (worker::farm::unique_name(), format!("worker {}", self.started));
         let mut command = self.command("worker");
         command.arg("--server").arg(server.to_string());
         command.args(["--threads", &threads.to_string(), "--name", &name]);
+        // One device is enough for all that a machine's processors trace.
+        command.args((splat && self.started == 1).then_some("--splat"));
         command.args(credentials.insecure().then_some("--insecure")).envs(credentials.environment());
         let child = command.spawn().map_err(|e| Failure::failed(format!("cannot start a worker: {e}")))?;
         let ended = {

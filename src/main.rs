@@ -1,8 +1,8 @@
 //! `ambience`: the one command users type. Here it is only wired: each subcommand has its room.
 //!
-//! - [`args`], [`render`], [`children`], [`familiar`], [`progress`], [`stats`]: `render`.
+//! - [`args`], [`view`], [`render`], [`children`], [`familiar`], [`progress`], [`stats`]: `render`.
 //! - [`compare`]: `compare`. [`cache`]: `cache`. `serve` and `worker` run the libraries `cache-server` and `worker`.
-//! - [`relay`]: `serve --upstream`.
+//! - [`splat`]: `splat`, and `worker --splat`. [`relay`]: `serve --upstream`.
 //! - [`parent`]: children end with their parent. [`failure`]: exit codes. [`say`]: stdout and stderr.
 
 use std::process::ExitCode;
@@ -22,7 +22,9 @@ mod progress;
 mod relay;
 mod render;
 mod say;
+mod splat;
 mod stats;
+mod view;
 
 use failure::Failure;
 
@@ -63,9 +65,17 @@ enum Command {
     Worker {
         #[command(flatten)]
         worker: worker::farm::WorkerArgs,
+        /// Let a GPU of this machine interpolate the pixels of frames that were asked for with --splat
+        #[arg(long)]
+        splat: bool,
         #[command(flatten)]
         owned: parent::OwnedArgs,
     },
+    /// Watch a picture while its records come in
+    ///
+    /// Draws what a server knows of the scene, seen by any camera, with a GPU or Mesa's lavapipe, and writes it to OUT.png every few
+    /// seconds while there is something new. Where no record answers yet, one path a pixel does.
+    Splat(splat::SplatArgs),
     /// Compare a picture with a reference
     ///
     /// Prints the relative RMSE (root mean squared difference of linear RGB over the mean of the reference), the bias
@@ -90,7 +100,7 @@ fn main() -> ExitCode {
         }
         Err(error) if error.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => {
             return end(Err(Failure::usage(
-                "expected a command: render, serve, worker, compare or cache (see ambience --help)",
+                "expected a command: render, serve, worker, splat, compare or cache (see ambience --help)",
             )));
         }
         Err(error) => return end(Err(Failure::usage(one_line(&error.render().to_string())))),
@@ -107,14 +117,12 @@ fn main() -> ExitCode {
                 }
             })
         }
-        Command::Worker { worker, owned } => {
+        Command::Worker { worker, splat, owned } => {
             owned.watch();
             worker::farm::log_to_stderr();
-            let credentials = worker.credentials.load(&worker.server).map_err(Failure::usage);
-            credentials.and_then(|credentials| {
-                worker::farm::block_on(worker, &credentials).map_err(|e| Failure::failed(format!("{e:#}")))
-            })
+            work(worker, splat)
         }
+        Command::Splat(args) => block_on(splat::run(args)),
         Command::Compare(args) => compare::run(&args),
         Command::Cache(command) => cache::run(&command),
     })
@@ -125,6 +133,14 @@ fn block_on(command: impl Future<Output = Result<(), Failure>>) -> Result<(), Fa
     let ended = runtime.block_on(command);
     runtime.shutdown_timeout(GRACE);
     ended
+}
+
+fn work(args: worker::farm::WorkerArgs, splat: bool) -> Result<(), Failure> {
+    let credentials = args.credentials.load(&args.server).map_err(Failure::usage)?;
+    if splat {
+        return splat::work(args, &credentials);
+    }
+    worker::farm::block_on::<worker::frame::Frame>(args, &credentials).map_err(|e| Failure::failed(format!("{e:#}")))
 }
 
 fn serve_failure(error: cache_server::ServeError) -> Failure {

@@ -60,8 +60,9 @@ pub async fn run(args: RenderArgs) -> Result<(), Failure> {
     ended
 }
 
+/// Waits until the command is told to end: the signal's number.
 #[cfg(unix)]
-async fn signalled() -> u8 {
+pub async fn signalled() -> u8 {
     use tokio::signal::unix::{SignalKind, signal};
     let wait = async |kind: SignalKind| {
         match signal(kind) {
@@ -77,8 +78,9 @@ async fn signalled() -> u8 {
     }
 }
 
+/// Waits until the command is told to end: the signal's number.
 #[cfg(not(unix))]
-async fn signalled() -> u8 {
+pub async fn signalled() -> u8 {
     if tokio::signal::ctrl_c().await.is_err() {
         std::future::pending().await
     }
@@ -102,7 +104,7 @@ async fn render(args: &RenderArgs, credentials: Credentials, children: &mut Chil
         }
         None => (frame, None),
     };
-    let job = job(&args.scene, &frame, forecast)?;
+    let job = job(args, &frame, forecast)?;
     drop(frame);
     for warning in &job.warnings {
         progress.note(&format!("warning: {warning}"));
@@ -125,17 +127,21 @@ struct Job {
 }
 
 /// Runs what takes long without holding up the runtime.
-async fn off_runtime<T: Send + 'static>(what: &str, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Failure> {
+pub async fn off_runtime<T: Send + 'static>(
+    what: &str,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Result<T, Failure> {
     tokio::task::spawn_blocking(work).await.map_err(|e| Failure::failed(format!("{what} failed: {e}")))
 }
 
 fn load(args: &RenderArgs) -> Result<Frame, Failure> {
-    let scene = scene::load(&args.scene).map_err(Failure::usage)?;
+    let scene = scene::load(&args.view.scene).map_err(Failure::usage)?;
     let settings = args.settings(&scene)?;
     Ok(Frame::new(scene, settings))
 }
 
-fn job(path: &Path, frame: &Frame, forecast: Option<(f32, Forecast)>) -> Result<Job, Failure> {
+fn job(args: &RenderArgs, frame: &Frame, forecast: Option<(f32, Forecast)>) -> Result<Job, Failure> {
+    let path = &args.view.scene;
     let (scene, shown) = (frame.scene(), path.display());
     let unreadable = |e: &dyn std::fmt::Display| Failure::usage(format!("{shown}: {e}"));
     let path = std::fs::canonicalize(path).map_err(|e| unreadable(&e))?;
@@ -145,7 +151,7 @@ fn job(path: &Path, frame: &Frame, forecast: Option<(f32, Forecast)>) -> Result<
         warnings.push(format!("{shown} has no light: the picture will be black"));
     }
     // Only the renderer itself knows how many levels a scene needs.
-    let spec = spec::message(frame, path, &scene.hash);
+    let spec = v1::FrameSpec { splat: args.splat, ..spec::message(frame, path, &scene.hash) };
     Ok(Job { settings: frame.settings().clone(), spec, warnings, forecast })
 }
 
@@ -235,7 +241,7 @@ impl Render<'_> {
         }
         self.stats.workers = self.args.workers().into();
         for _ in 0..self.args.workers() {
-            self.children.start_worker(&server, &self.credentials, self.args.threads)?;
+            self.children.start_worker(&server, &self.credentials, self.args.threads, self.args.splat)?;
         }
         Ok(server)
     }
@@ -329,7 +335,7 @@ impl Render<'_> {
                 let again = self.spare > 0;
                 if again {
                     self.spare -= 1;
-                    self.children.start_worker(server, &self.credentials, self.args.threads)?;
+                    self.children.start_worker(server, &self.credentials, self.args.threads, self.args.splat)?;
                 }
                 let what = if again { "starting another" } else { "going on without it" };
                 self.progress.note(&format!("warning: {title} ended, {}; {what}", how(status)));
@@ -403,7 +409,7 @@ impl Render<'_> {
             return Ok(());
         }
         say::result(format_args!(
-            "{} and {}: {seconds:.1} s, {} records{}, {} rounds{}{}",
+            "{} and {}: {seconds:.1} s, {} records{}, {} rounds{}{}{}",
             self.args.output.display(),
             self.args.png().display(),
             done.records,
@@ -413,7 +419,8 @@ impl Render<'_> {
                 let believed = 100.0 * believed(&forecast, done).total();
                 format!("; error asked {} %, believed {believed:.2} %", 100.0 * asked)
             }),
-            gathered_per_sample(done)
+            gathered_per_sample(done),
+            splatted(job, done)
         ))
     }
 }
@@ -435,6 +442,20 @@ fn gathered_per_sample(done: &v1::FrameDone) -> String {
         "; {:.0} % of the samples gathered for themselves, where records would be as dense as pixels",
         100.0 * share
     )
+}
+
+/// How much of a picture that was to be splatted is, and whether devices were lost.
+fn splatted(job: &Job, done: &v1::FrameDone) -> String {
+    if !job.spec.splat {
+        return String::new();
+    }
+    let count = |name: &str| done.counts.iter().filter(|c| c.name == name).map(|c| c.value).sum::<f64>();
+    let lost = match count("devices_lost") {
+        0.0 => String::new(),
+        lost => format!(", {lost} devices lost"),
+    };
+    let share = 100.0 * count("samples.splatted") / count("samples").max(1.0);
+    format!("; {share:.0} % of the samples splatted{lost}")
 }
 
 /// Why a picture may be black.
@@ -461,7 +482,7 @@ fn bounces(settings: &Settings) -> String {
 fn attributes(job: &Job, done: &v1::FrameDone) -> Vec<(&'static str, String)> {
     let s = &job.settings;
     let vector = |v: glam::Vec3| format!("{} {} {}", v.x, v.y, v.z);
-    vec![
+    let mut attributes = vec![
         ("version", VERSION.into()),
         ("scene_hash", hex(&job.spec.scene_hash)),
         ("namespace", hex(&job.spec.namespace)),
@@ -479,7 +500,10 @@ fn attributes(job: &Job, done: &v1::FrameDone) -> Vec<(&'static str, String)> {
         ("camera_right", vector(s.camera.right)),
         ("camera_up", vector(s.camera.up)),
         ("camera_parallel", s.camera.parallel.to_string()),
-    ]
+    ];
+    // Its bits are those of a device.
+    attributes.extend(job.spec.splat.then(|| ("splat", "true".into())));
+    attributes
 }
 
 /// What the picture itself tells of its error: sampling and noise from all of its pixels, interpolation from the pilot.

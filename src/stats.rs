@@ -88,6 +88,8 @@ impl Stats {
             "gathered_per_sample": count("regathers"),
             "candidates_left_dense": count("dense"),
             "samples": count("samples"),
+            "samples_splatted": count("samples.splatted"),
+            "devices_lost": count("devices_lost"),
             "bytes": {
                 "records_inserted": count("bytes.inserted"),
                 "records_subscribed": count("bytes.subscribed"),

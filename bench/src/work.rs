@@ -87,6 +87,7 @@ pub fn spec(width: u32, height: u32) -> v1::FrameSpec {
         seed: 0,
         levels: 2,
         adaptive: false,
+        splat: false,
         effort: None,
     }
 }

@@ -128,7 +128,7 @@ impl Board {
             self.base(&namespace, convert::digest(&base)?).await
         };
         let effort = job.spec.effort.map(|effort| v1::Effort { samples: 0.0, ..effort });
-        let view = v1::FrameSpec { scene: String::new(), spp: 0, effort, ..job.spec.clone() };
+        let view = v1::FrameSpec { scene: String::new(), spp: 0, splat: false, effort, ..job.spec.clone() };
         let view = [view.encode_to_vec(), cache_proto::VERSION.into()].concat();
         let draft = namespace.draft(base.sum.digest, &view);
         if job.spec.levels > 0 {

@@ -142,6 +142,7 @@ pub(crate) mod tests {
             seed: 0,
             levels,
             adaptive: false,
+            splat: false,
             effort: None,
         }
     }

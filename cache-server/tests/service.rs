@@ -326,6 +326,7 @@ fn spec() -> v1::FrameSpec {
         seed: 0,
         levels: 1,
         adaptive: false,
+        splat: false,
         effort: None,
     }
 }

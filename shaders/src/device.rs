@@ -1,11 +1,15 @@
 //! The adapter records are drawn with.
 
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use worker::splat::Lost;
 
 /// Floats blended as they are.
 const BLENDABLE: wgpu::Features = wgpu::Features::FLOAT32_BLENDABLE;
+
+/// How long work may take: a processor that draws a hundred thousand records on the largest picture needs 15 s.
+const PATIENCE: Duration = Duration::from_secs(120);
 
 /// A device, ready to be given work.
 pub struct Gpu {
@@ -65,9 +69,10 @@ impl Gpu {
     /// # Errors
     /// As [`Self::check`].
     pub fn wait(&self) -> Result<(), Lost> {
-        let waited = self.device.poll(wgpu::PollType::wait_indefinitely());
-        waited.map_err(|e| Lost(format!("{}: {e}", self.name)))?;
-        self.check()
+        let waited = self.device.poll(wgpu::PollType::Wait { submission_index: None, timeout: Some(PATIENCE) });
+        // What it complained of says more.
+        self.check()?;
+        waited.map(drop).map_err(|e| Lost(format!("{}: no answer for {} s: {e}", self.name, PATIENCE.as_secs())))
     }
 
     /// A buffer that holds `content`, or four zeros where there is none: no binding may be empty.

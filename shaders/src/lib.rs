@@ -13,11 +13,13 @@
 //! - [`device`]: the adapter.
 //! - [`passes`]: pipelines.
 //! - [`splatter`]: records on the device, and points that ask them.
+//! - [`node`]: the worker that has one.
 
 pub mod layout;
 pub mod reach;
 pub mod twin;
 
 pub mod device;
+pub mod node;
 pub mod passes;
 pub mod splatter;

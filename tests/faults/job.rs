@@ -63,6 +63,7 @@ pub fn view(number: u32, tiles: u32, levels: u32) -> v1::FrameSpec {
         seed: 0,
         levels,
         adaptive: number % 2 == 1,
+        splat: false,
         effort: None,
     }
 }

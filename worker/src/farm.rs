@@ -18,7 +18,6 @@ use tracing::{debug, info, warn};
 use crate::client::{self, Address, Backoff, Cache, Frames, Line};
 use crate::credentials::{CredentialArgs, Credentials};
 use crate::follow;
-use crate::frame::Frame;
 use crate::job::{Dropped, Job, Work};
 use crate::ready::{Fault, Shelf};
 use crate::scenes::Scenes;
@@ -61,11 +60,11 @@ pub struct WorkerArgs {
 ///
 /// # Errors
 /// The server is of another version, or has been away for [`client::PATIENCE`].
-pub async fn run(args: WorkerArgs, credentials: &Credentials) -> anyhow::Result<()> {
+pub async fn run<J: Job>(args: WorkerArgs, credentials: &Credentials) -> anyhow::Result<()> {
     let threads = args.threads.map_or_else(|| cores().min(THREADS_MAX as usize), usize::from);
     let traffic = Traffic::default();
     let line = client::connect_counted(&args.server, credentials, &traffic).map_err(anyhow::Error::msg)?;
-    let worker = Arc::new(Worker::<Frame>::new(args.name.unwrap_or_else(unique_name), line, traffic));
+    let worker = Arc::new(Worker::<J>::new(args.name.unwrap_or_else(unique_name), line, traffic));
     info!(name = worker.name, %args.server, threads, "working");
     let ended = tokio::select! {
         lost = worker.clone().work(threads) => Err(lost),
@@ -88,9 +87,9 @@ pub async fn run(args: WorkerArgs, credentials: &Credentials) -> anyhow::Result<
 ///
 /// # Errors
 /// As [`run`].
-pub fn block_on(args: WorkerArgs, credentials: &Credentials) -> anyhow::Result<()> {
+pub fn block_on<J: Job>(args: WorkerArgs, credentials: &Credentials) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
-    let ended = runtime.block_on(run(args, credentials));
+    let ended = runtime.block_on(run::<J>(args, credentials));
     runtime.shutdown_background();
     ended
 }

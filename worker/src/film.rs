@@ -102,7 +102,13 @@ impl Film {
         if std::mem::replace(have, true) {
             return Ok(false);
         }
-        let mut floats = bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+        self.put(tile, bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])));
+        Ok(true)
+    }
+
+    /// Puts the floats of a tile of the picture in place, whether or not it has come before.
+    pub fn put(&mut self, tile: u32, mut floats: impl Iterator<Item = f32>) {
+        let [x0, x1, y0, y1] = self.settings.tile(tile);
         for y in y0..y1 {
             for x in x0..x1 {
                 let at = y as usize * self.settings.width as usize + x as usize;
@@ -111,7 +117,6 @@ impl Film {
                 }
             }
         }
-        Ok(true)
     }
 
     /// Tiles that have not come.

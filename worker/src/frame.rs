@@ -66,6 +66,9 @@ const FIRST_SAMPLES: u32 = 4;
 /// that are the same everywhere: its pixel's other samples share the error.
 const MISSED_RAYS: f32 = 0.25;
 
+/// No records.
+static NONE: Levels = Levels::new();
+
 /// What was counted while working, for the statistics.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Counts {
@@ -85,6 +88,10 @@ pub struct Counts {
     pub reused: u64,
     /// Samples of finished pixels.
     pub samples: u64,
+    /// Of these, those of pixels that a device interpolated.
+    pub splatted: u64,
+    /// Devices that were lost in the middle of that.
+    pub devices_lost: u64,
     /// What finished pixels that see surfaces alone add up to.
     pub surfaces: Sums,
     /// What the others add up to, which look straight into light.
@@ -133,6 +140,8 @@ impl Counts {
         self.dense += other.dense;
         self.reused += other.reused;
         self.samples += other.samples;
+        self.splatted += other.splatted;
+        self.devices_lost += other.devices_lost;
         self.surfaces.add(&other.surfaces);
         self.lights.add(&other.lights);
         self.test_seconds += other.test_seconds;
@@ -408,7 +417,19 @@ impl Frame {
         sealed: &Levels,
         splat: &mut dyn Splat,
     ) -> Result<(Vec<Vec<f32>>, Counts), Lost> {
-        let (mut counts, tracer) = (Counts::default(), self.finishing(sealed));
+        self.told(&self.finishing(sealed), tiles, splat)
+    }
+
+    /// The same where what no record covers is followed as paths: pixels to look at while records come in.
+    ///
+    /// # Errors
+    /// Those of `splat`.
+    pub fn preview(&self, tiles: Range<u32>, splat: &mut dyn Splat) -> Result<Vec<Vec<f32>>, Lost> {
+        Ok(self.told(&self.tracer(&NONE), tiles, splat)?.0)
+    }
+
+    fn told(&self, tracer: &Tracer, tiles: Range<u32>, splat: &mut dyn Splat) -> Result<(Vec<Vec<f32>>, Counts), Lost> {
+        let mut counts = Counts::default();
         let new = |tile| self.settings.pixels(tile).map(|[x, y]| Pixel::new(&self.settings, x, y)).collect();
         let mut done: Vec<Vec<Pixel>> = tiles.clone().map(new).collect();
         let first = self.first_samples();
@@ -416,14 +437,14 @@ impl Frame {
         let mut index = 0;
         while index < wanted.iter().copied().max().unwrap_or(0) {
             let look = |(pixel, wanted): (&Pixel, &u32)| {
-                if index < *wanted { pixel.look(index, &tracer, &self.settings, &mut counts) } else { None }
+                if index < *wanted { pixel.look(index, tracer, &self.settings, &mut counts) } else { None }
             };
             let looks: Vec<_> = done.iter().flatten().zip(&wanted).map(look).collect();
             let mut answers = splat.answers(&mut looks.iter().flatten())?.into_iter();
             for ((pixel, wanted), look) in done.iter_mut().flatten().zip(&wanted).zip(&looks) {
                 if index < *wanted {
                     let told = look.as_ref().and_then(|_| answers.next().flatten());
-                    pixel.sample_told(index, told, &tracer, &self.settings, &mut counts);
+                    pixel.sample_told(index, told, tracer, &self.settings, &mut counts);
                 }
             }
             index += 1;
@@ -432,12 +453,12 @@ impl Frame {
             }
         }
         done.iter().flatten().for_each(|pixel| counts.finish(pixel));
+        counts.splatted = counts.samples;
         Ok((done.iter().map(|pixels| means(pixels)).collect(), counts))
     }
 
     /// Where the first surface along a ray from the camera asks records, and which.
     pub fn look(&self, ray: (Vec3, Vec3), counts: &mut Counts) -> Option<(Query, Served<'_>)> {
-        static NONE: Levels = Levels::new();
         self.tracer(&NONE).look(ray, counts)
     }
 

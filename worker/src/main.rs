@@ -5,6 +5,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use worker::farm::{self, WorkerArgs};
+use worker::frame::Frame;
 
 /// Renders for a server of Ambience until it is told to stop.
 #[derive(Parser)]
@@ -26,7 +27,7 @@ fn main() -> ExitCode {
             return ExitCode::from(2);
         }
     };
-    match farm::block_on(args.worker, &credentials) {
+    match farm::block_on::<Frame>(args.worker, &credentials) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
             say(format!("{e:#}"));

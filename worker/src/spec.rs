@@ -39,6 +39,7 @@ fn written(settings: &Settings, levels: u32, namespace: &Namespace, path: &str, 
         levels,
         effort: settings.effort.map(|Effort { rays, least_rays, samples }| v1::Effort { rays, samples, least_rays }),
         adaptive: settings.details.adaptive,
+        splat: false,
     }
 }
 

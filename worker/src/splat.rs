@@ -1,9 +1,12 @@
 //! The seam for splatting: what records tell where the camera looks may come from elsewhere than the octree.
 
+use std::sync::Mutex;
+
 use cache_core::Query;
 
 use crate::levels::Reflected;
 use crate::lobes::Served;
+use crate::threads::lock;
 
 /// Where a sample of a pixel asks records.
 pub struct Look<'a> {
@@ -27,4 +30,11 @@ pub trait Splat {
     /// # Errors
     /// [`Lost`]: it will not answer any more.
     fn answers(&mut self, looks: &mut dyn Iterator<Item = &Look>) -> Result<Vec<Option<Reflected>>, Lost>;
+}
+
+/// For threads that trace side by side and have one device, which draws for each in turn.
+impl<S: Splat> Splat for &Mutex<S> {
+    fn answers(&mut self, looks: &mut dyn Iterator<Item = &Look>) -> Result<Vec<Option<Reflected>>, Lost> {
+        lock(self).answers(looks)
+    }
 }

@@ -80,7 +80,8 @@ fn ready(described: &v1::FrameSpec, scene: Scene, settings: Settings) -> anyhow:
     Ok(frame)
 }
 
-fn run(frame: &Frame, work: &Work) -> Option<Done> {
+/// What the processor makes of a lease; `None` when nobody waits for it.
+pub fn run(frame: &Frame, work: &Work) -> Option<Done> {
     let clock = CpuClock::start();
     let mut done = Done::default();
     // The server counts tiles as we do; a range past the end would make tiles nobody can place.
@@ -97,7 +98,7 @@ fn run(frame: &Frame, work: &Work) -> Option<Done> {
             }
             Step::Pixels => {
                 let (pixels, counts) = frame.pixels(tile, &work.levels);
-                done.tiles.push(v1::FrameTile { tile, pixels: packed(&pixels).into() });
+                done.finish(tile, &pixels);
                 counts
             }
         };
@@ -108,10 +109,16 @@ fn run(frame: &Frame, work: &Work) -> Option<Done> {
 }
 
 impl Done {
+    /// Adds a finished tile.
+    pub fn finish(&mut self, tile: u32, pixels: &[f32]) {
+        self.tiles.push(v1::FrameTile { tile, pixels: packed(pixels).into() });
+    }
+
     /// The counts of `Complete`: `cpu_seconds.PHASE`, `records.PHASE`, `rays.path.PHASE`, `rays.shadow.PHASE` (PHASE is
     /// `level N` or `pixels`), `records.radiance` (of those of level 1), `cpu_seconds.tests` (of those of the levels, what was not spent on gathers), `proposals`,
     /// `queries`, `misses`, `regathers` (of the misses, samples of pixels that gathered for themselves), `dense` (candidates left
-    /// alone where records would be as dense as pixels), `reused` (of the records, those found), and of bytes on the wire `bytes.inserted` and
+    /// alone where records would be as dense as pixels), `reused` (of the records, those found), `samples` of pixels, of these
+    /// `samples.splatted`, `devices_lost` (that splatted), and of bytes on the wire `bytes.inserted` and
     /// `bytes.subscribed` (packed records), `bytes.tiles` (packed pixels).
     pub fn counts(&self, step: &v1::Step, inserted: u64, subscribed: u64) -> Vec<v1::Count> {
         let phase = match step.level {
@@ -135,6 +142,8 @@ impl Done {
             ("dense".into(), self.counts.dense as f64),
             ("reused".into(), self.counts.reused as f64),
             ("samples".into(), self.counts.samples as f64),
+            ("samples.splatted".into(), self.counts.splatted as f64),
+            ("devices_lost".into(), self.counts.devices_lost as f64),
             ("bytes.inserted".into(), inserted as f64),
             ("bytes.subscribed".into(), subscribed as f64),
             ("bytes.tiles".into(), tiles as f64),
