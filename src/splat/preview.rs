@@ -16,16 +16,19 @@ use worker::farm::cores;
 use worker::film::{self, Film};
 use worker::follow::Follower;
 use worker::frame::Frame;
-use worker::levels::Level;
+use worker::levels::{Level, Reflected};
 use worker::scene;
 use worker::settings::{Method, Settings, TILE};
 use worker::spec;
-use worker::splat::Lost;
+use worker::splat::{Look, Lost, Splat};
 
 use super::SplatArgs;
 use crate::failure::Failure;
 use crate::render::{off_runtime, signalled};
 use crate::say;
+
+/// How much farther than in the picture records count where none answers: what is missing is sketched.
+const REACHES: [f32; 3] = [1.0, 3.0, 9.0];
 
 /// Rows of tiles that a thread traces at a time.
 const BAND: u32 = 4;
@@ -133,11 +136,9 @@ impl Watched<'_> {
         }
         let (gpu, frame, output) = (self.gpu.clone(), shown.frame.clone(), self.args.output.clone());
         let draw = move || {
-            let mut level = Level::new(frame.settings().a, Details::default());
-            level.unite(records.values());
-            let png = draw(gpu, &frame, &level).map_err(Failure::failed)?.png().map_err(Failure::failed)?;
+            let png = draw(&gpu, &frame, &records).map_err(Failure::failed)?.png().map_err(Failure::failed)?;
             film::stage(&output, &png).and_then(film::Staged::publish).map_err(Failure::failed)?;
-            Ok::<_, Failure>(level.len())
+            Ok::<_, Failure>(records.len())
         };
         let records = off_runtime("drawing", draw).await??;
         shown.digest = digest;
@@ -194,12 +195,33 @@ fn records(logs: &BTreeMap<Namespace, Follower>) -> BTreeMap<RecordId, Record> {
     held.flat_map(|part| part.records).filter(|(tag, _)| tag.level == 1).map(|(_, r)| (r.id(), r)).collect()
 }
 
+/// Draws records, and where none answers, the same counting farther.
+struct Sketch([Splatter; 3]);
+
+impl Splat for Sketch {
+    fn answers(&mut self, looks: &mut dyn Iterator<Item = &Look>) -> Result<Vec<Option<Reflected>>, Lost> {
+        let looks: Vec<_> = looks.collect();
+        let mut answers = vec![None; looks.len()];
+        for splatter in &mut self.0 {
+            let open: Vec<_> = (0..looks.len()).filter(|i| answers[*i].is_none()).collect();
+            let told = splatter.answers(&mut open.iter().map(|i| looks[*i]))?;
+            open.into_iter().zip(told).for_each(|(i, told)| answers[i] = told);
+        }
+        Ok(answers)
+    }
+}
+
 /// A picture of what records say: its rows of tiles are shared between all cores, which have one device.
-fn draw(gpu: Arc<Gpu>, frame: &Frame, level: &Level) -> Result<Film, Lost> {
+fn draw(gpu: &Arc<Gpu>, frame: &Frame, records: &BTreeMap<RecordId, Record>) -> Result<Film, Lost> {
     let settings = frame.settings();
-    let mut splatter = Splatter::new(gpu, settings);
-    splatter.load(level);
-    let splatter = Mutex::new(splatter);
+    let loaded = |farther: f32| {
+        let mut level = Level::new(farther * settings.a, Details::default());
+        level.unite(records.values());
+        let mut splatter = Splatter::new(gpu.clone(), settings);
+        splatter.load(&level);
+        splatter
+    };
+    let splatter = Mutex::new(Sketch(REACHES.map(loaded)));
     let (columns, rows) = (settings.width.div_ceil(TILE), settings.height.div_ceil(TILE));
     let next = AtomicU32::new(0);
     let trace = || {
