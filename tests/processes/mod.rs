@@ -1,6 +1,8 @@
 //! The program as users start it, for tests that look at what processes leave behind.
 #![allow(dead_code, reason = "each test file uses its part")]
 
+pub mod farm;
+
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};

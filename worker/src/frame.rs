@@ -425,7 +425,7 @@ impl Frame {
     /// # Errors
     /// Those of `splat`.
     pub fn preview(&self, tiles: Range<u32>, splat: &mut dyn Splat) -> Result<Vec<Vec<f32>>, Lost> {
-        Ok(self.told(&self.tracer(&NONE), tiles, splat)?.0)
+        Ok(self.told(&self.looking(&NONE), tiles, splat)?.0)
     }
 
     fn told(&self, tracer: &Tracer, tiles: Range<u32>, splat: &mut dyn Splat) -> Result<(Vec<Vec<f32>>, Counts), Lost> {
