@@ -5,12 +5,11 @@
 mod processes;
 
 use std::path::PathBuf;
-use std::process::{Child, Command, Stdio};
+use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use processes::farm::Farm;
-use processes::{alive, ambience, busy_worker, children, collect, cpu_ticks, render, signal, wait_for};
-use tempfile::TempDir;
+use processes::{alive, ambience, busy_worker, children, collect, render, signal, wait_for};
 
 #[test]
 fn the_picture_does_not_depend_on_workers_threads_transport_or_run() {

@@ -75,6 +75,7 @@ pub fn spec() -> v1::FrameSpec {
         seed: 0,
         levels: 1,
         adaptive: false,
+        splat: false,
         effort: None,
     }
 }

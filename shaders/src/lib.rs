@@ -11,7 +11,7 @@
 //! What runs them:
 //!
 //! - [`device`]: the adapter.
-//! - [`passes`]: pipelines.
+//! - [`passes`]; their pipelines.
 //! - [`splatter`]: records on the device, and points that ask them.
 //! - [`node`]: the worker that has one.
 

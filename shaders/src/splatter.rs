@@ -63,7 +63,7 @@ struct Region {
 
 /// Where sums are.
 enum Summed {
-    Blended([wgpu::TextureView; 3]),
+    Blended(Box<[wgpu::TextureView; 3]>),
     Stored(wgpu::Buffer),
 }
 
@@ -162,7 +162,7 @@ impl Splatter {
         let mut bound = vec![(0, uniform.as_entire_binding()), (1, region.answers.as_entire_binding())];
         match &region.sums {
             Summed::Blended(views) => {
-                bound.extend((2..).zip(views).map(|(at, view)| (at, wgpu::BindingResource::TextureView(view))));
+                bound.extend((2..).zip(views.iter()).map(|(at, view)| (at, wgpu::BindingResource::TextureView(view))));
             }
             Summed::Stored(sums) => bound.push((2, sums.as_entire_binding())),
         }
@@ -297,7 +297,7 @@ impl Region {
             answers: gpu.room(answers, storage | from),
             read: gpu.room(answers, wgpu::BufferUsages::MAP_READ | to),
             sums: if gpu.blends {
-                Summed::Blended([target(), target(), target()])
+                Summed::Blended(Box::new([target(), target(), target()]))
             } else {
                 Summed::Stored(gpu.room(pixels * PIXEL_BYTES, storage | to))
             },
