@@ -301,9 +301,8 @@ impl Render<'_> {
         let base: Vec<u8> = self.base.as_ref().map_or_else(Vec::new, |base| base.digest.clone());
         let opening = client::retry(|| {
             let (spec, base) = (Some(job.spec.clone()), base.clone().into());
-            let request = v1::OpenRequest { spec, version: VERSION.into(), base };
             let mut frames = frames.clone();
-            async move { frames.open(request).await }
+            async move { frames.open(v1::OpenRequest { spec, base }).await }
         });
         tokio::pin!(opening);
         let slow = tokio::time::sleep(SLOW);

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use ambience_bench::judge::{judge, load, reference, rgb, settings};
 use cache_core::details::Details;
 use cache_core::rounds::RANKS;
+use cache_proto::v1;
 use cache_proto::v1::frame_event::Event;
-use cache_proto::{VERSION, v1};
 use cache_server::{Config, Node, serve_on};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -85,7 +85,7 @@ async fn farmed(spec: v1::FrameSpec, workers: usize) -> (Vec<Vec<u8>>, v1::Frame
         let worker = Arc::new(Worker::<Frame>::new(format!("w{number}"), line.clone(), Traffic::default()));
         tasks.spawn(async move { drop(worker.work(1 + number % 2).await) });
     }
-    let request = v1::OpenRequest { spec: Some(spec), version: VERSION.into(), ..Default::default() };
+    let request = v1::OpenRequest { spec: Some(spec), ..Default::default() };
     let mut events = client::frames(line).open(request).await.expect("opened").into_inner();
     let mut tiles = std::collections::BTreeMap::new();
     loop {

@@ -12,8 +12,8 @@ use std::sync::{Arc, mpsc};
 use std::time::{Duration, Instant};
 
 use cache_core::RecordId;
+use cache_proto::v1;
 use cache_proto::v1::frame_event::Event;
-use cache_proto::{VERSION, v1};
 use worker::client;
 use worker::farm::Worker;
 use worker::job::Known;
@@ -174,7 +174,7 @@ fn frame(args: &FarmArgs, workers: u32) -> Result<Run, Box<dyn Error>> {
         let before = (host.usage()?.cpu, host::usage()?.cpu);
         let (start, mut phase) = (Instant::now(), (Instant::now(), PHASES[0]));
         let mut phases = BTreeMap::new();
-        let request = v1::OpenRequest { spec: Some(spec), version: VERSION.into(), ..Default::default() };
+        let request = v1::OpenRequest { spec: Some(spec), ..Default::default() };
         let mut events = client::frames(host.connect()).open(request).await?.into_inner();
         let done = loop {
             let event = events.message().await?.and_then(|event| event.event);

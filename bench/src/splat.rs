@@ -11,7 +11,7 @@ use shaders::layout::Splats;
 use shaders::splatter::Splatter;
 use worker::frame::{Counts, Frame};
 use worker::levels::{Level, Reflected};
-use worker::settings::Settings;
+use worker::settings::{Method, Settings};
 use worker::solo::{self, Order};
 use worker::splat::{Look, Splat as _};
 
@@ -26,6 +26,9 @@ pub struct SplatArgs {
     /// Rounds that take turns; medians are printed
     #[arg(long, default_value_t = 5)]
     rounds: usize,
+    /// Records of radiance, of the glossy floor, in place of those of irradiance, of the stairs
+    #[arg(long)]
+    gloss: bool,
     /// Sum by a compute pass, as on devices that cannot add floats to a picture
     #[arg(long)]
     compute: bool,
@@ -44,13 +47,14 @@ type Times = [Vec<f64>; 3];
 pub fn run(args: &SplatArgs) -> Result<(), Box<dyn Error>> {
     let gpu = Arc::new(Gpu::new(!args.compute)?);
     let threads = rayon::current_num_threads();
-    println!("the stairs; {}, octree with {threads} threads; medians of {} rounds in turn", gpu.name, args.rounds);
+    let scene = if args.gloss { "glossy-floor.glb" } else { "stairs.glb" };
+    println!("{scene}; {}, octree with {threads} threads; medians of {} rounds in turn", gpu.name, args.rounds);
     println!(
         "records     picture     splat: whole, device alone     octree    octree / splat     points off by more than 1e-4"
     );
     for &count in &args.records {
         for [width, height] in SIZES {
-            let (frame, level) = filled(width, height, count);
+            let (frame, level) = filled(scene, width, height, count);
             let looks = looks(&frame);
             let mut splatter = Splatter::new(gpu.clone(), frame.settings());
             splatter.take(Splats::of(&level));
@@ -82,13 +86,14 @@ pub fn run(args: &SplatArgs) -> Result<(), Box<dyn Error>> {
 }
 
 /// A frame that some `count` records fill, gathered with few rays, and these.
-fn filled(width: u32, height: u32, count: usize) -> (Frame, Level) {
+fn filled(scene: &str, width: u32, height: u32, count: usize) -> (Frame, Level) {
+    let method = if scene == "stairs.glb" { Method::Irradiance } else { Method::Radiance };
     let mut a = 0.3;
     loop {
-        let (scene, camera) = load("stairs.glb");
+        let (scene, camera) = load(scene);
         let base = settings(camera.with_aspect(width as f32 / height as f32), "one");
         let details = Details { spacing: Spacing::Free, ..Details::default() };
-        let frame = Frame::new(scene, Settings { width, height, a, rays: 16, bounces: 1, details, ..base });
+        let frame = Frame::new(scene, Settings { width, height, a, method, rays: 16, bounces: 1, details, ..base });
         let level = solo::fill(&frame, Order::Rounds).remove(0);
         let ratio = level.len() as f32 / count as f32;
         if (0.8..1.25).contains(&ratio) {

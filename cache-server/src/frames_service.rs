@@ -20,7 +20,7 @@ use crate::clock::Clock;
 use crate::frame::{News, Origin};
 use crate::frames::{Changes, Filled, Frames};
 use crate::limits::Limits;
-use crate::refusal::{Refusal, same_version};
+use crate::refusal::Refusal;
 use crate::replica::Mark;
 use crate::scenes::{Reading, Scenes};
 use crate::spec::{self, Job};
@@ -111,8 +111,7 @@ impl Board {
 
     /// Opens a frame of a tenant: finds its base, begins its draft. Returns its number.
     async fn open(&self, tenant: &Tenant, request: v1::OpenRequest) -> Result<(u64, Namespace), Refusal> {
-        let v1::OpenRequest { spec, version, base } = request;
-        same_version(&version)?;
+        let v1::OpenRequest { spec, base } = request;
         let job = Job::check(spec.ok_or(Refusal::Malformed(Malformed::Missing("spec")))?)?;
         let namespace = job.namespace;
         self.store.replica().belongs(&namespace, tenant.name())?;
@@ -235,9 +234,7 @@ impl FramesTrait for FramesService {
 
     async fn lease(&self, request: Request<v1::LeaseRequest>) -> Result<Response<v1::LeaseResponse>, Status> {
         let tenant = tenant(&request);
-        let v1::LeaseRequest { worker, version } = request.into_inner();
-        same_version(&version)?;
-        let lease = self.0.lease(&tenant, &named(&tenant, &worker)?).await?;
+        let lease = self.0.lease(&tenant, &named(&tenant, &request.get_ref().worker)?).await?;
         Ok(Response::new(v1::LeaseResponse { lease }))
     }
 

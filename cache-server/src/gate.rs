@@ -17,7 +17,7 @@ use crate::access::{Shown, Tenant, Tokens};
 use crate::door::Pass;
 use crate::inflow::{Holding, Inflow};
 use crate::metrics;
-use crate::refusal::Refusal;
+use crate::refusal::{Refusal, same_version};
 
 /// Names one call in logs and answers: the client's own, or a number.
 const REQUEST_ID: &str = "x-request-id";
@@ -39,7 +39,7 @@ impl Gate {
         Self { tokens: Arc::new(tokens), inflow: Arc::new(Inflow::new(inflow)), calls: Arc::default() }
     }
 
-    /// Whether a call may be made; then its request carries its [`Tenant`], and is counted.
+    /// Whether a call may be made: it shows a token that is asked for, and is not of another build. Then its request carries its [`Tenant`], and is counted.
     fn admit(&self, mut request: Request<Body>) -> Result<Request<Body>, Refusal> {
         let pass = request.extensions().get::<Pass>().cloned();
         let holding = pass.as_ref().map_or_else(Holding::default, |pass| pass.holding().clone());
@@ -49,6 +49,9 @@ impl Gate {
             }
             let authorization = request.headers_mut().remove(AUTHORIZATION);
             let tenant = self.tokens.check(authorization.as_ref().map(HeaderValue::as_bytes))?;
+            if let Some(version) = request.headers().get(cache_proto::VERSION_KEY) {
+                same_version(&String::from_utf8_lossy(version.as_bytes()))?;
+            }
             tracing::Span::current().record("tenant", tenant.name());
             request.extensions_mut().insert::<Tenant>(tenant);
             request.extensions_mut().insert(Shown(authorization));

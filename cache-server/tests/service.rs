@@ -7,13 +7,13 @@ use cache_core::{Irradiance, Namespace, Query, Record, RecordId, Sealed, Shrink,
 use cache_proto::v1::cache_client::CacheClient;
 use cache_proto::v1::frame_event::Event;
 use cache_proto::v1::frames_client::FramesClient;
-use cache_proto::{VERSION, convert, v1};
+use cache_proto::{VERSION, VERSION_KEY, convert, v1};
 use cache_server::{Config, Listen, ServeError, bind, serve};
 use glam::{Vec2, Vec3};
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 use tonic::transport::{Channel, Endpoint};
-use tonic::{Code, Status};
+use tonic::{Code, Request, Status};
 
 const NAMESPACE: Namespace = Namespace([3; 32]);
 
@@ -331,12 +331,12 @@ fn spec() -> v1::FrameSpec {
     }
 }
 
-fn open(version: &str) -> v1::OpenRequest {
-    v1::OpenRequest { spec: Some(spec()), version: version.into(), base: Default::default() }
+fn open() -> v1::OpenRequest {
+    v1::OpenRequest { spec: Some(spec()), base: Default::default() }
 }
 
 fn ask(worker: &str) -> v1::LeaseRequest {
-    v1::LeaseRequest { worker: worker.into(), version: VERSION.into() }
+    v1::LeaseRequest { worker: worker.into() }
 }
 
 /// Does whatever it is given, for ever: one record for each tile in the first step, then none.
@@ -372,7 +372,7 @@ async fn work(server: &Server, name: &str) -> Infallible {
 async fn a_frame_is_filled_by_two_workers_and_told_to_its_owner() {
     let server = Server::unix().await;
     let mut frames = server.frames();
-    let mut events = soon(frames.open(open(VERSION))).await.expect("opened").into_inner();
+    let mut events = soon(frames.open(open())).await.expect("opened").into_inner();
     let (mut tiles, mut steps, mut frame) = (vec![], 0, None);
     let owner = async {
         while let Some(event) = events.message().await.expect("no error") {
@@ -406,7 +406,7 @@ async fn a_frame_is_filled_by_two_workers_and_told_to_its_owner() {
     let held: Vec<_> = info.namespaces.iter().map(|n| (n.namespace.to_vec(), n.records, n.digest.clone())).collect();
     assert_eq!(held, [(NAMESPACE.0.to_vec(), 3, done.digest.clone())]);
     assert_eq!(info.namespaces[0].label.as_ref().map(|l| l.scene.as_str()), Some("box.glb"));
-    let mut again = soon(frames.open(open(VERSION))).await.expect("opened").into_inner();
+    let mut again = soon(frames.open(open())).await.expect("opened").into_inner();
     let told = soon(again.message()).await.expect("no error").expect("told").event;
     assert!(matches!(told, Some(Event::Opened(opened)) if opened.base_records == 3 && opened.base == done.digest));
     let described = soon(frames.describe(v1::DescribeRequest { frame: frame.expect("opened") })).await;
@@ -421,7 +421,7 @@ async fn an_owner_that_goes_away_cancels_its_frame() {
     // A worker that waits already is woken by the frame.
     let (waiting, opened) = {
         let mut other = server.frames();
-        tokio::join!(async move { soon(other.lease(ask("w"))).await }, soon(frames.open(open(VERSION))))
+        tokio::join!(async move { soon(other.lease(ask("w"))).await }, soon(frames.open(open())))
     };
     let lease = waiting.expect("served").into_inner().lease.expect("work");
     let described = soon(frames.describe(v1::DescribeRequest { frame: lease.frame })).await.expect("open");
@@ -446,23 +446,40 @@ async fn an_owner_that_goes_away_cancels_its_frame() {
 }
 
 #[tokio::test]
-async fn frames_refuse_by_name() {
+async fn calls_of_another_version_are_refused() {
+    fn of<T>(version: &'static str, message: T) -> Request<T> {
+        let mut request = Request::new(message);
+        request.metadata_mut().insert(VERSION_KEY, version.parse().expect("ASCII"));
+        request
+    }
     let server = Server::unix().await;
-    let mut frames = server.frames();
+    let (mut cache, mut frames) = (server.cache(), server.frames());
+    let query = || v1::QueryRequest { namespace: vec![7; 32].into(), level: 1, a: 0.3, points: Default::default() };
     let old = [
-        soon(frames.open(open("0.0.0"))).await.expect_err("old"),
-        soon(frames.lease(v1::LeaseRequest { version: "0.0.0".into(), ..ask("w") })).await.expect_err("old"),
+        soon(frames.open(of("0.0.0", open()))).await.expect_err("old"),
+        soon(frames.lease(of("0.0.0", ask("w")))).await.expect_err("old"),
+        soon(cache.insert(of("0.0.0", tokio_stream::iter([])))).await.expect_err("old"),
+        soon(cache.query(of("0.0.0", query()))).await.expect_err("old"),
     ];
     for status in old {
         assert_eq!(status.code(), Code::FailedPrecondition);
         assert!(status.message().contains("0.0.0") && status.message().contains(VERSION), "{status}");
     }
-    let mut request = open(VERSION);
+    soon(cache.query(of(VERSION, query()))).await.expect("the same version");
+    soon(cache.query(query())).await.expect("a client that does not say");
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn frames_refuse_by_name() {
+    let server = Server::unix().await;
+    let mut frames = server.frames();
+    let mut request = open();
     request.spec.as_mut().expect("there").tile_size = 1000;
     let status = soon(frames.open(request)).await.expect_err("too large");
     assert_eq!(status.code(), Code::InvalidArgument);
     assert!(status.message().contains("tile_size"), "{status}");
-    let status = soon(frames.open(v1::OpenRequest { spec: None, ..open(VERSION) })).await.expect_err("none");
+    let status = soon(frames.open(v1::OpenRequest { spec: None, ..open() })).await.expect_err("none");
     assert!(status.message().contains("spec is missing"), "{status}");
     let status = soon(frames.lease(ask(&"x".repeat(65)))).await.expect_err("too long");
     assert_eq!(status.code(), Code::InvalidArgument);

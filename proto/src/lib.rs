@@ -19,3 +19,6 @@ pub const SCENE_BYTES_MAX: usize = 256 << 20;
 
 /// Version of this build; client and server must agree on it.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// Metadata by which a caller says its version.
+pub const VERSION_KEY: &str = "ambience-version";

@@ -6,7 +6,7 @@ use std::time::Duration;
 use cache_core::id::Digest;
 use cache_core::{Record, RecordId, Tag};
 use cache_proto::v1::frame_event::Event;
-use cache_proto::{VERSION, convert, v1};
+use cache_proto::{convert, v1};
 use tonic::Status;
 use worker::client;
 
@@ -119,7 +119,7 @@ async fn attempt(farm: &Rc<Farm>, spec: &v1::FrameSpec, base: &mut Option<Base>)
     let opening = client::retry(|| {
         let (spec, base) = (Some(spec.clone()), asked.clone());
         let mut frames = frames.clone();
-        async move { frames.open(v1::OpenRequest { spec, version: VERSION.into(), base }).await }
+        async move { frames.open(v1::OpenRequest { spec, base }).await }
     });
     let mut away = farm.away.subscribe();
     let mut events = match opening.await {

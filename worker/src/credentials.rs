@@ -5,6 +5,7 @@ use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use cache_proto::{VERSION, VERSION_KEY};
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
 use tonic::transport::Certificate;
@@ -117,7 +118,7 @@ impl Authority {
     }
 }
 
-/// Adds the token, if there is one, to every call. It is marked sensitive, so that no log shows it.
+/// Adds this build's version to every call, and the token, if there is one. It is marked sensitive, so that no log shows it.
 #[derive(Clone, Debug, Default)]
 pub struct Bearer {
     authorization: Option<MetadataValue<Ascii>>,
@@ -156,6 +157,7 @@ impl Bearer {
 
 impl Interceptor for Bearer {
     fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
+        request.metadata_mut().insert(VERSION_KEY, MetadataValue::from_static(VERSION));
         if let Some(value) = &self.authorization {
             request.metadata_mut().insert("authorization", value.clone());
         }

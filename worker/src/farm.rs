@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use cache_core::{Namespace, Record, Tag};
-use cache_proto::{VERSION, v1};
+use cache_proto::v1;
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 use tonic::{Code, Status};
@@ -217,7 +217,7 @@ impl<J: Job> Worker<J> {
     async fn lease(self: Arc<Self>) -> Status {
         loop {
             let asked = Instant::now();
-            let request = v1::LeaseRequest { worker: self.name.clone(), version: VERSION.into() };
+            let request = v1::LeaseRequest { worker: self.name.clone() };
             let leased = client::retry(|| {
                 let (mut frames, request) = (self.frames.clone(), request.clone());
                 async move { frames.lease(request).await }
