@@ -9,6 +9,7 @@ use worker::task::CpuClock;
 
 use crate::judge::{SIZE, judge, load, reduce, reference, rgb, settings};
 use crate::own;
+use crate::strip::Strip;
 
 /// Which errors to ask for, and of what.
 #[derive(clap::Args)]
@@ -22,6 +23,9 @@ pub struct AskedArgs {
     /// Errors to ask for
     #[arg(long, value_delimiter = ',', default_values_t = [0.05f32, 0.02, 0.01])]
     error: Vec<f32>,
+    /// Write DIR/SCENE.DEPTH-ERROR.png: reference and picture side by side, four times as bright as they would be shown
+    #[arg(long, value_name = "DIR")]
+    pictures: Option<std::path::PathBuf>,
     /// Edge of the pictures, a multiple of 128
     #[arg(long, default_value_t = SIZE as u32)]
     edge: u32,
@@ -62,7 +66,12 @@ pub fn run(args: &AskedArgs) -> Result<(), Box<dyn Error>> {
                 (frame, forecast, levels.iter().map(|l| l.len()).collect::<Vec<_>>(), pixels, counts, seconds)
             });
             let image = rgb(&pixels);
-            let v = judge(&reduce(&image), &truth);
+            let image = reduce(&image);
+            let v = judge(&image, &truth);
+            if let Some(folder) = &args.pictures {
+                std::fs::create_dir_all(folder)?;
+                Strip::whole(4.0).of(&[&truth.image, &image]).save(folder.join(format!("{name}-{error}.png")))?;
+            }
             let e = pilot::reached(&counts, &forecast);
             let percent = |v: f64| 100.0 * v;
             println!(

@@ -11,6 +11,7 @@ use worker::solo::{self, Order};
 use worker::task::CpuClock;
 
 use crate::judge::{SIZE, judge, load, reference, rgb, settings};
+use crate::strip::Strip;
 
 /// Which choices to measure, and on what.
 #[derive(clap::Args)]
@@ -137,8 +138,8 @@ fn pictures(args: &DetailsArgs, folder: &Path) -> Result<(), Box<dyn Error>> {
             percent(without.2.worst),
         );
         let place = without.2.place.map(|at| at.saturating_sub(CROP / 2 - 4).min(SIZE - CROP));
-        let strip = strip(&[&truth.image, &with.0, &without.0], place);
-        strip.save(folder.join(format!("{name}.png")))?;
+        let strip = Strip { place, crop: CROP, enlarged: ENLARGED, exposure: 1.0 };
+        strip.of(&[&truth.image, &with.0, &without.0]).save(folder.join(format!("{name}.png")))?;
     }
     Ok(())
 }
@@ -146,22 +147,6 @@ fn pictures(args: &DetailsArgs, folder: &Path) -> Result<(), Box<dyn Error>> {
 /// Edge of what is shown of a picture, and how much it is enlarged.
 const CROP: usize = 48;
 const ENLARGED: usize = 4;
-
-/// The same place of several pictures side by side, in sRGB, as bright as the first one's brightest there allow.
-fn strip(pictures: &[&Vec<[f64; 3]>], [left, top]: [usize; 2]) -> image::RgbImage {
-    let at = |picture: &[[f64; 3]], x: usize, y: usize| picture[(top + y) * SIZE + left + x];
-    let mut bright: Vec<f64> = (0..CROP * CROP).flat_map(|i| at(pictures[0], i % CROP, i / CROP)).collect();
-    bright.sort_by(f64::total_cmp);
-    let exposure = 0.9 / bright[bright.len() * 98 / 100];
-    let gap = CROP * ENLARGED + 8;
-    image::RgbImage::from_fn((gap * pictures.len() - 8) as u32, (CROP * ENLARGED) as u32, |x, y| {
-        let (which, x, y) = (x as usize / gap, x as usize % gap / ENLARGED, y as usize / ENLARGED);
-        if x >= CROP {
-            return image::Rgb([255; 3]);
-        }
-        image::Rgb(at(pictures[which], x, y).map(|v| worker::film::srgb((v * exposure) as f32)))
-    })
-}
 
 /// The default, and the default with one thing changed.
 fn choices() -> Vec<(&'static str, Details)> {

@@ -24,7 +24,7 @@
 //! - [`splat`]: records drawn by a graphics adapter, against the octree.
 //! - [`work`]: what a simulated worker computes.
 //! - [`farm`]: one frame by farms of many sizes.
-//! - [`report`]: tables and charts.
+//! - [`report`]: tables and charts. [`strip`]: pictures side by side.
 
 pub mod asked;
 pub mod details;
@@ -58,3 +58,4 @@ pub mod farm;
 pub mod work;
 
 pub mod report;
+pub mod strip;
