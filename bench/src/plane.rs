@@ -3,7 +3,7 @@
 
 use bytemuck::{Pod, Zeroable};
 use cache_core::math::Frame;
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 use worker::bvh::Bvh;
 use worker::scene::{Rgb, Triangle};
 
@@ -102,10 +102,12 @@ pub fn direction(size: u32, pixel: u32) -> Vec3 {
     Vec3::new(slope(pixel % size), -slope(pixel / size), 1.0)
 }
 
-/// The twin of `rasterise.wgsl`: of each pixel the number of the triangle a ray through its middle meets, plus one; 0: none.
-pub fn rasterise(bvh: &Bvh, eye: &Eye, size: u32) -> Vec<u32> {
+/// The twin of `rasterise.wgsl`: of each pixel the number of the triangle a ray through it meets, plus one; 0: none. `beside`: so many
+/// pixels to the right of and above its middle.
+pub fn rasterise(bvh: &Bvh, eye: &Eye, size: u32, beside: Vec2) -> Vec<u32> {
+    let off = (beside * (2.0 * HALF / size as f32)).extend(0.0);
     let pixel = |pixel| {
-        let way = eye.to_world(direction(size, pixel));
+        let way = eye.to_world(direction(size, pixel) + off);
         bvh.closest(eye.position.into(), way, f32::INFINITY).map_or(0, |hit| hit.triangle + 1)
     };
     (0..size * size).map(pixel).collect()
@@ -132,6 +134,9 @@ mod tests {
 
     use super::*;
 
+    /// The plane's share of the hemisphere, by projected solid angle: 4 / π · 2 / √5 · atan(2 / √5).
+    const SHARE: f64 = 0.831_029;
+
     /// Irradiance from a sky given by direction.
     fn under(sky: impl Fn(Vec3) -> f32, size: u32, missing: Missing) -> f64 {
         let pixels = (0..).zip(weights(size, missing));
@@ -141,7 +146,7 @@ mod tests {
     #[test]
     fn a_white_sky_gives_pi_unless_what_the_plane_misses_is_black() {
         for size in [1, 2, 3, 16, 64, 256] {
-            for (missing, share) in Missing::ALL.into_iter().zip([0.83106, 1.0, 1.0]) {
+            for (missing, share) in Missing::ALL.into_iter().zip([SHARE, 1.0, 1.0]) {
                 let told = under(|_| 1.0, size, missing) / PI;
                 assert!((told - share).abs() < 1e-5, "{missing:?} at {size}: {told}");
             }
@@ -162,7 +167,7 @@ mod tests {
         let (axis, sine) = (Vec3::new(0.3, -0.2, 1.0).normalize(), 0.5f32);
         let ball = |d: Vec3| f32::from(u8::from(d.dot(axis) > (1.0 - sine * sine).sqrt()));
         let truth = PI * f64::from(sine * sine * axis.z);
-        for (missing, share) in Missing::ALL.into_iter().zip([1.0, 1.0 / 0.83106, 1.0]) {
+        for (missing, share) in Missing::ALL.into_iter().zip([1.0, 1.0 / SHARE, 1.0]) {
             let told = under(ball, 256, missing) / truth;
             assert!((told - share).abs() < 2e-3, "{missing:?}: {told}");
         }

@@ -46,6 +46,9 @@ fn main() {
     libtest_mimic::run(&arguments, trials.into()).exit();
 }
 
+/// As in `plane.rs`: what the plane covers of the hemisphere.
+const SHARE: f32 = 0.831_029;
+
 /// Odd sizes, and more records than one picture holds of the large ones.
 const SIZES: [u32; 4] = [16, 33, 64, 256];
 
@@ -60,23 +63,24 @@ fn pixels_see_what_rays_through_them_meet(gpu: &Arc<Gpu>) {
             Rasteriser::new(gpu.clone(), &case.world.scene.triangles, &case.glow, &weights(size, Missing::Border));
         let all = rasteriser.seen(&case.eyes).expect("a device");
         assert_eq!(all.len(), case.eyes.len());
-        let (mut off, mut seen) = (0, 0);
+        let (mut off, mut odd, mut seen) = (0, 0, 0);
         for (drawn, eye) in all.iter().zip(&case.eyes) {
-            let met = rasterise(&case.bvh, eye, size);
-            seen += met.iter().filter(|triangle| **triangle != 0).count();
-            for at in (0..met.len()).filter(|at| met[*at] != drawn[*at]) {
-                off += 1;
-                // Only where two triangles meet, within a pixel.
-                let [x, y] = [at % size as usize, at / size as usize];
-                let near = |i: usize| i.saturating_sub(1)..(i + 2).min(size as usize);
-                let beside = near(y).any(|y| near(x).any(|x| met[y * size as usize + x] == drawn[at]));
-                assert!(beside, "{size}: pixel {x} {y} of {eye:?} sees {}, not {}", drawn[at], met[at]);
+            let met = |beside| rasterise(&case.bvh, eye, size, beside);
+            let middle = met(Vec2::ZERO);
+            seen += middle.iter().filter(|triangle| **triangle != 0).count();
+            let differ: Vec<usize> = (0..middle.len()).filter(|at| middle[*at] != drawn[*at]).collect();
+            off += differ.len();
+            if !differ.is_empty() {
+                // Devices round corners to a 256th of a pixel.
+                let around: Vec<_> = (0..8).map(|k| met(Vec2::from_angle(PI * k as f32 / 4.0) / 128.0)).collect();
+                odd += differ.iter().filter(|at| around.iter().all(|met| met[**at] != drawn[**at])).count();
             }
         }
         let pixels = all.len() * (size * size) as usize;
-        println!("{size}: {off} of {pixels} pixels differ");
+        println!("{size}: {off} of {pixels} pixels differ, {odd} of them where no edge is near");
         assert!(seen * 100 > pixels * 99, "the room is closed");
-        assert!(off * 200 < pixels, "{size}: {off} of {pixels} pixels differ");
+        // Tips of triangles narrower than the rounding.
+        assert!(off * 500 < pixels && odd * 10_000 < pixels, "{size}: {off}, {odd} of {pixels}");
     }
 }
 
@@ -98,7 +102,7 @@ fn sums_are_those_of_the_twin(gpu: &Arc<Gpu>) {
         let [middle, most] = [off[off.len() / 2], off[off.len() - 1]];
         println!("{size} {missing:?}: median {middle:.1e}, most {most:.1e}");
         // A rounding moves a pixel to the next cell.
-        assert!(middle < 1e-5 && most < 1e-2, "{size} {missing:?}: {middle} {most}");
+        assert!(middle < 1e-5 && most < 1e-3, "{size} {missing:?}: {middle} {most}");
     }
 }
 
@@ -123,7 +127,7 @@ fn rooms_and_balls_are_exact(gpu: &Arc<Gpu>) {
     let told = |triangles: &[Triangle], glow: &Glow, missing| {
         Rasteriser::new(gpu.clone(), triangles, glow, &weights(128, missing)).gather(&eyes).expect("a device")
     };
-    for (missing, share) in Missing::ALL.into_iter().zip([0.83106, 1.0, 1.0]) {
+    for (missing, share) in Missing::ALL.into_iter().zip([SHARE, 1.0, 1.0]) {
         for e in told(&room, &glow, missing) {
             let off = (e / PI - Rgb::new(share, share * 0.5, 0.0)).abs().max_element();
             assert!(off < 1e-4, "{missing:?}: {e}");
@@ -141,7 +145,7 @@ fn rooms_and_balls_are_exact(gpu: &Arc<Gpu>) {
     let away = middle - Vec3::from(eyes[0].position);
     let truth = PI * (radius / away.length()).powi(2) * away.normalize().z;
     let glow = Glow::of(ball.iter().map(|_| Rgb::ONE));
-    for (missing, share) in Missing::ALL.into_iter().zip([1.0, 1.0 / 0.83106, 1.0]) {
+    for (missing, share) in Missing::ALL.into_iter().zip([1.0, 1.0 / SHARE, 1.0]) {
         let e = told(&ball, &glow, missing)[0].x / truth;
         println!("ball, {missing:?}: {e}");
         assert!((e - share).abs() < 5e-3, "{missing:?}: {e} of the truth, not {share}");
