@@ -44,15 +44,15 @@ impl Rasteriser {
     pub fn new(gpu: Arc<Gpu>, triangles: &[Triangle], glow: &Glow, weights: &[f32]) -> Self {
         let size = weights.len().isqrt() as u32;
         let columns = (EDGE_MAX / size).clamp(1, COLUMNS_MAX);
-        let given = format!(
-            "const SIZE: u32 = {size}u;\nconst COLUMNS: u32 = {columns}u;\nconst CELLS: u32 = {}u;\nconst HALF: f32 = {HALF:?};\n",
-            glow.cells
-        );
-        let draw = draw(&gpu, &module(&gpu, &given, RASTERISE));
+        let module = |pass| {
+            let source = wgpu::ShaderSource::Wgsl(source(size, columns, glow.cells, pass).into());
+            gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor { label: None, source })
+        };
+        let draw = draw(&gpu, &module(RASTERISE));
         let sum = gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: None,
             layout: None,
-            module: &module(&gpu, &given, INTEGRATE),
+            module: &module(INTEGRATE),
             entry_point: Some("integrate"),
             compilation_options: Default::default(),
             cache: None,
@@ -191,9 +191,10 @@ impl Rasteriser {
     }
 }
 
-fn module(gpu: &Gpu, given: &str, pass: &str) -> wgpu::ShaderModule {
-    let source = wgpu::ShaderSource::Wgsl([given, PLANE, pass].concat().into());
-    gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor { label: None, source })
+fn source(size: u32, columns: u32, cells: u32, pass: &str) -> String {
+    let numbers =
+        format!("const SIZE: u32 = {size}u;\nconst COLUMNS: u32 = {columns}u;\nconst CELLS: u32 = {cells}u;\n");
+    format!("{numbers}const HALF: f32 = {HALF:?};\n{PLANE}{pass}")
 }
 
 fn draw(gpu: &Gpu, module: &wgpu::ShaderModule) -> wgpu::RenderPipeline {
@@ -230,4 +231,34 @@ fn bind(gpu: &Gpu, layout: &wgpu::BindGroupLayout, bound: Vec<wgpu::BindingResou
     let entry = |(binding, resource)| wgpu::BindGroupEntry { binding, resource };
     let entries: Vec<_> = (0..).zip(bound).map(entry).collect();
     gpu.device.create_bind_group(&wgpu::BindGroupDescriptor { label: None, layout, entries: &entries })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::mem::offset_of;
+
+    use wgpu::naga::{TypeInner, front::wgsl, valid};
+
+    use super::*;
+
+    /// On machines without a graphics adapter too.
+    #[test]
+    fn shaders_are_sound_and_see_eyes_as_rust_does() {
+        for pass in [RASTERISE, INTEGRATE] {
+            let source = source(64, 16, 64, pass);
+            let module = wgsl::parse_str(&source).unwrap_or_else(|e| panic!("{}", e.emit_to_string(&source)));
+            let mut validator = valid::Validator::new(valid::ValidationFlags::all(), valid::Capabilities::empty());
+            validator.validate(&module).expect("it is sound");
+            let eye = module.types.iter().find(|(_, t)| t.name.as_deref() == Some("Eye")).expect("it is there").1;
+            let TypeInner::Struct { members, span } = &eye.inner else { panic!("no struct") };
+            let offset =
+                |name: &str| members.iter().find(|m| m.name.as_deref() == Some(name)).map(|m| m.offset as usize);
+            assert_eq!(
+                (offset("position"), offset("near")),
+                (Some(offset_of!(Eye, position)), Some(offset_of!(Eye, near)))
+            );
+            assert_eq!(["x", "y", "z"].map(offset), [16, 32, 48].map(Some));
+            assert_eq!(*span as usize, size_of::<Eye>());
+        }
+    }
 }
