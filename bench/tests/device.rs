@@ -93,12 +93,15 @@ fn sums_are_those_of_the_twin(gpu: &Arc<Gpu>) {
         let told = rasteriser.gather(&case.eyes).expect("a device");
         let seen = rasteriser.seen(&case.eyes).expect("a device");
         assert_eq!(told.len(), case.eyes.len());
+        let mut lit = 0;
         let off = |((told, seen), eye): ((&Rgb, &Vec<u32>), &Eye)| {
             let twin = integrate(triangles, &case.glow, eye, seen, &weights);
+            lit += usize::from(twin != Rgb::ZERO);
             (*told - twin).abs().max_element() / twin.max_element().max(1e-6)
         };
         let mut off: Vec<f32> = told.iter().zip(&seen).zip(&case.eyes).map(off).collect();
         off.sort_by(f32::total_cmp);
+        assert!(lit * 10 > off.len() * 9, "light comes almost everywhere");
         let [middle, most] = [off[off.len() / 2], off[off.len() - 1]];
         println!("{size} {missing:?}: median {middle:.1e}, most {most:.1e}");
         // A rounding moves a pixel to the next cell.
