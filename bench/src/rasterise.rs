@@ -145,7 +145,7 @@ fn cpu() -> f64 {
 
 /// One way to gather.
 enum Way {
-    Rasterised(Rasteriser),
+    Rasterised(Box<Rasteriser>),
     Traced(Strata),
 }
 
@@ -216,7 +216,7 @@ fn scene(
     for (of, missing) in ["black", "ratio", "border"].into_iter().zip(Missing::ALL) {
         for size in SIZES {
             let rasteriser = Rasteriser::new(gpu.clone(), triangles, &case.glow, &weights(size, missing));
-            ways.push((format!("rasterised, {of}"), format!("{size} x {size}"), Way::Rasterised(rasteriser)));
+            ways.push((format!("rasterised, {of}"), format!("{size} x {size}"), Way::Rasterised(Box::new(rasteriser))));
         }
     }
     for rays in RAYS {
