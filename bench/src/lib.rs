@@ -22,6 +22,10 @@
 //! - [`host`]: a server in a process of its own.
 //! - [`service`]: records in and out, queries and latency, as ratios to the bare stream.
 //! - [`splat`]: records drawn by a graphics adapter, against the octree.
+//! - [`plane`]: a hemisphere seen through a plane: weights of its pixels, and what draws it, in Rust.
+//! - [`glow`]: what surfaces send out, kept on their triangles.
+//! - [`rasteriser`]: irradiance of records by a graphics adapter.
+//! - [`rasterise`]: gathers rasterised, against gathers traced.
 //! - [`work`]: what a simulated worker computes.
 //! - [`farm`]: one frame by farms of many sizes.
 //! - [`report`]: tables and charts. [`strip`]: pictures side by side.
@@ -48,6 +52,11 @@ pub mod rays;
 pub mod soups;
 pub mod splat;
 pub mod start;
+
+pub mod glow;
+pub mod plane;
+pub mod rasterise;
+pub mod rasteriser;
 
 pub mod bare;
 pub mod host;

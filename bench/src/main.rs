@@ -3,7 +3,9 @@
 use std::error::Error;
 
 use ambience_bench::host::HostArgs;
-use ambience_bench::{asked, details, farm, gloss, host, lamps, lookups, peers, pictures, rays, service, splat, start};
+use ambience_bench::{
+    asked, details, farm, gloss, host, lamps, lookups, peers, pictures, rasterise, rays, service, splat, start,
+};
 use clap::{Parser, Subcommand};
 
 /// Speed against accuracy: every method at several settings, on the scenes with references.
@@ -31,6 +33,8 @@ enum Command {
     Lookups(lookups::LookupsArgs),
     /// Records splat by a graphics adapter, against the octree with all cores
     Splat(splat::SplatArgs),
+    /// Hemispheres of records rasterised by a graphics adapter, against traced ones
+    Rasterise(rasterise::RasteriseArgs),
     /// A thousand lamps against one
     Lamps(lamps::LampsArgs),
     /// Radiance, Mitsuba, and Mitsuba with Open Image Denoise, on the same scenes
@@ -56,6 +60,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         Some(Command::Rays(args)) => rays::run(&args),
         Some(Command::Lookups(args)) => lookups::run(&args),
         Some(Command::Splat(args)) => splat::run(&args),
+        Some(Command::Rasterise(args)) => rasterise::run(&args),
         Some(Command::Lamps(args)) => lamps::run(&args),
         Some(Command::Peers(args)) => peers::run(&args),
         Some(Command::Start(args)) => start::run(&args),
