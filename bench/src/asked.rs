@@ -9,7 +9,7 @@ use worker::task::CpuClock;
 
 use crate::judge::{SIZE, judge, load, reduce, reference, rgb, settings};
 use crate::own;
-use crate::strip::Strip;
+use crate::strip::{Panel, Strip};
 
 /// Which errors to ask for, and of what.
 #[derive(clap::Args)]
@@ -23,7 +23,8 @@ pub struct AskedArgs {
     /// Errors to ask for
     #[arg(long, value_delimiter = ',', default_values_t = [0.05f32, 0.02, 0.01])]
     error: Vec<f32>,
-    /// Write DIR/SCENE.DEPTH-ERROR.png: reference and picture side by side, four times as bright as they would be shown
+    /// Write DIR/SCENE.DEPTH-ERROR.png: reference, picture, the picture four times as bright, and how much brighter or darker than
+    /// the reference it is, white and black being 5 %
     #[arg(long, value_name = "DIR")]
     pictures: Option<std::path::PathBuf>,
     /// Edge of the pictures, a multiple of 128
@@ -70,7 +71,14 @@ pub fn run(args: &AskedArgs) -> Result<(), Box<dyn Error>> {
             let v = judge(&image, &truth);
             if let Some(folder) = &args.pictures {
                 std::fs::create_dir_all(folder)?;
-                Strip::whole(4.0).of(&[&truth.image, &image]).save(folder.join(format!("{name}-{error}.png")))?;
+                let panels = [
+                    Panel::Light(&truth.image, 1.0),
+                    Panel::Light(&image, 1.0),
+                    Panel::Light(&image, 4.0),
+                    Panel::Difference(&image, &truth.image, 0.05),
+                ];
+                let strip = Strip { place: [0; 2], crop: SIZE, enlarged: 2 };
+                strip.of(&panels).save(folder.join(format!("{name}-{error}.png")))?;
             }
             let e = pilot::reached(&counts, &forecast);
             let percent = |v: f64| 100.0 * v;

@@ -11,7 +11,7 @@ use worker::solo::{self, Order};
 use worker::task::CpuClock;
 
 use crate::judge::{SIZE, judge, load, reference, rgb, settings};
-use crate::strip::Strip;
+use crate::strip::{Panel, Strip};
 
 /// Which choices to measure, and on what.
 #[derive(clap::Args)]
@@ -138,8 +138,10 @@ fn pictures(args: &DetailsArgs, folder: &Path) -> Result<(), Box<dyn Error>> {
             percent(without.2.worst),
         );
         let place = without.2.place.map(|at| at.saturating_sub(CROP / 2 - 4).min(SIZE - CROP));
-        let strip = Strip { place, crop: CROP, enlarged: ENLARGED, exposure: 1.0 };
-        strip.of(&[&truth.image, &with.0, &without.0]).save(folder.join(format!("{name}.png")))?;
+        let strip = Strip { place, crop: CROP, enlarged: ENLARGED };
+        strip
+            .of(&[&truth.image, &with.0, &without.0].map(|picture| Panel::Light(picture, 1.0)))
+            .save(folder.join(format!("{name}.png")))?;
     }
     Ok(())
 }
