@@ -55,3 +55,4 @@ pub use record::Record;
 pub use sealed::Sealed;
 pub use set::{RecordSet, Tag};
 pub use shrink::Shrink;
+pub use site::radius_least;

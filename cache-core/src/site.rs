@@ -12,6 +12,12 @@ const LENGTH_MAX: f32 = 1e18;
 /// spacing of floats.
 const RADIUS_LEAST: f32 = 1.0 / (1u64 << 32) as f32;
 
+/// R of a record must be more than this: far below the spacing of floats at its place it tells nothing, and clamped by it all
+/// records around would be worth nothing.
+pub fn radius_least(position: Vec3, radius_max: f32) -> f32 {
+    RADIUS_LEAST * position.abs().max_element().max(radius_max)
+}
+
 /// How far, in R, a record may lie in front of a query and still count: enough for curved surfaces made of facets.
 const IN_FRONT_TOLERANCE: f32 = 0.01;
 
@@ -88,8 +94,7 @@ pub(crate) fn check(
         let expected = "more than 2^-32 of its distance from the origin";
         return Err(Invalid::Range { field: "radius_max", value: radius_max, expected });
     }
-    // Far below the spacing of floats there, R tells nothing; clamped by it, all records around would be worth nothing.
-    if radius <= RADIUS_LEAST * reach.max(radius_max) {
+    if radius <= radius_least(position, radius_max) {
         let expected = "more than 2^-32 of its distance from the origin and of radius_max";
         return Err(Invalid::Range { field: "radius", value: radius, expected });
     }

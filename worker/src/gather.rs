@@ -8,7 +8,9 @@ use cache_core::id::{Origin, Random};
 use cache_core::incoming::Bands;
 use cache_core::math::Frame;
 use cache_core::mesh::turned;
-use cache_core::{Irradiance, Namespace, Packed as _, Query, Radiance, Record, RecordId, of_order, radiance};
+use cache_core::{
+    Irradiance, Namespace, Packed as _, Query, Radiance, Record, RecordId, of_order, radiance, radius_least,
+};
 
 use glam::{Vec2, Vec3};
 
@@ -179,9 +181,9 @@ impl Gather<'_> {
 
     /// R of a record, and the least it counts with.
     fn radius(&self, site: &Site, met: f32) -> (f32, f32) {
-        // In a crack rays end nearer than floats lie there; less than that tells nothing.
-        let spacing = f32::EPSILON * site.at.position.abs().max_element().max(site.radius_bounds.1);
-        let radius = met.min(4.0 * self.tracer.world.radius).max(spacing);
+        // In a crack rays end at no distance at all: the record is for its own site alone.
+        let least = 2.0 * radius_least(site.at.position, site.radius_bounds.1);
+        let radius = met.min(4.0 * self.tracer.world.radius).max(least);
         (radius, site.radius_bounds.0.min(STRETCH * radius))
     }
 }
