@@ -7,10 +7,11 @@ use cache_core::details::{Details, Distance, Gradients, Metric, Spacing, Weighti
 use cache_core::rounds::RANKS;
 use worker::frame::Frame;
 use worker::settings::Settings;
-use worker::solo::{self, Order};
+use worker::solo::{self, Filled, Order};
 use worker::task::CpuClock;
 
-use crate::judge::{SIZE, judge, load, reference, rgb, settings};
+use crate::judge::{Reference, SIZE, Verdict, judge, load, reference, rgb, settings};
+use crate::report::quantile;
 use crate::strip::{Panel, Strip};
 
 /// Which choices to measure, and on what.
@@ -31,6 +32,9 @@ pub struct DetailsArgs {
     /// Samples a pixel
     #[arg(long, default_value_t = 64)]
     spp: u32,
+    /// How many seeds; medians are printed
+    #[arg(long, default_value_t = 1)]
+    seeds: u64,
     /// In place of the table: for each detail the place where a picture without it errs most, into this folder
     #[arg(long, value_name = "DIR")]
     pictures: Option<PathBuf>,
@@ -46,9 +50,9 @@ pub fn run(args: &DetailsArgs) -> Result<(), Box<dyn Error>> {
     }
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
     println!(
-        "{SIZE}x{SIZE}, --rays {} --spp {}; records of level 1, of all; CPU seconds of the fill; RMSE, bias, worst block; passes, \
-         proposals, tests and sealing as shares of the fill",
-        args.rays, args.spp
+        "{SIZE}x{SIZE}, --rays {} --spp {}, medians of {} seeds; records of level 1, of all; CPU seconds of the fill; RMSE, bias, worst block, and that of \
+         the worst seed; passes, proposals, tests and sealing as shares of the fill",
+        args.rays, args.spp, args.seeds
     );
     for name in &args.scenes {
         let (scene, depth) = name.split_once('.').ok_or("expected SCENE.DEPTH, for instance stairs.full")?;
@@ -59,32 +63,52 @@ pub fn run(args: &DetailsArgs) -> Result<(), Box<dyn Error>> {
                 continue;
             }
             for &a in &args.a {
-                let base = settings(camera.clone(), depth);
-                let frame = Frame::new(scene.clone(), Settings { a, rays: args.rays, spp: args.spp, details, ..base });
-                let (filled, pixels, seconds) = one_thread.install(|| {
-                    let clock = CpuClock::start();
-                    let filled = solo::fill_ranks(&frame, Order::Rounds, RANKS);
-                    let seconds = clock.seconds();
-                    let pixels = solo::pixels(&frame, &filled.levels).0;
-                    (filled, pixels, seconds)
+                let seeds = (0..args.seeds).map(|seed| {
+                    let base = settings(camera.clone(), depth);
+                    Settings { a, seed, rays: args.rays, spp: args.spp, details, ..base }
                 });
-                let v = judge(&rgb(&pixels), &truth);
-                let first = filled.levels.first().map_or(0, |l| l.len());
-                let all: usize = filled.levels.iter().map(|l| l.len()).sum();
-                let testing = 100.0 * filled.counts.test_seconds / seconds;
+                let all =
+                    seeds.map(|settings| one_thread.install(|| measure(&Frame::new(scene.clone(), settings), &truth)));
+                let all: Vec<Measured> = all.collect();
+                let of = |value: fn(&Measured) -> f64| quantile(&mut all.iter().map(value).collect::<Vec<_>>(), 0.5);
+                let worst = all.iter().map(|m| m.verdict.worst).fold(0.0, f64::max);
                 println!(
-                    "{name:16} {choice:34} a {a:<4} {first:6} {all:6} {seconds:7.2} s  {:5.2}% {:+5.2}% {:5.2}%  {:3} {:6} {testing:5.1}% {:5.1}%",
-                    100.0 * v.rmse,
-                    100.0 * v.bias,
-                    100.0 * v.worst,
-                    filled.passes,
-                    filled.proposals,
-                    100.0 * filled.sealing_seconds / seconds,
+                    "{name:16} {choice:34} a {a:<4} {:6} {:6} {:7.2} s  {:5.2}% {:+5.2}% {:5.2}% {:5.2}%  {:3} {:6} {:5.1}% {:5.1}%",
+                    of(|m| m.records[0] as f64),
+                    of(|m| m.records.iter().sum::<usize>() as f64),
+                    of(|m| m.seconds),
+                    100.0 * of(|m| m.verdict.rmse),
+                    100.0 * of(|m| m.verdict.bias),
+                    100.0 * of(|m| m.verdict.worst),
+                    100.0 * worst,
+                    of(|m| m.filled.passes.into()),
+                    of(|m| m.filled.proposals as f64),
+                    100.0 * of(|m| m.filled.counts.test_seconds / m.seconds),
+                    100.0 * of(|m| m.filled.sealing_seconds / m.seconds),
                 );
             }
         }
     }
     Ok(())
+}
+
+/// What came of one picture.
+struct Measured {
+    /// Of each level.
+    records: Vec<usize>,
+    filled: Filled,
+    /// CPU seconds of the fill.
+    seconds: f64,
+    verdict: Verdict,
+}
+
+fn measure(frame: &Frame, truth: &Reference) -> Measured {
+    let clock = CpuClock::start();
+    let filled = solo::fill_ranks(frame, Order::Rounds, RANKS);
+    let seconds = clock.seconds();
+    let verdict = judge(&rgb(&solo::pixels(frame, &filled.levels).0), truth);
+    let records = filled.levels.iter().map(|level| level.len()).collect();
+    Measured { records, filled: Filled { levels: Vec::new(), ..filled }, seconds, verdict }
 }
 
 /// Where each detail shows: the scene that breaks without it, the allowed error there, and what is done without it.
