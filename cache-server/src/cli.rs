@@ -15,7 +15,7 @@ use crate::journal::device::Sync;
 use crate::journal::disk::{self, Disk};
 use crate::journal::recovery::OpenError;
 use crate::limits::{self, Limits, Setting};
-use crate::listen::{Bound, Listen, ServeError, bind};
+use crate::listen::{Bound, Listen, ServeError, bind, bind_health};
 use crate::serve::{Config, serve};
 use crate::tls::Tls;
 use crate::{clock, files, metrics};
@@ -49,6 +49,9 @@ pub struct ServeArgs {
     /// Where Prometheus reads metrics: HOST:PORT, over plain HTTP
     #[arg(long, value_name = "ADDR")]
     pub metrics: Option<SocketAddr>,
+    /// Answer calls of grpc.health.v1 alone here, unencrypted, for probes that know no TLS: HOST:PORT
+    #[arg(long, value_name = "ADDR")]
+    pub health: Option<SocketAddr>,
     /// How log lines on stderr look
     #[arg(long, value_name = "FORMAT", value_enum, default_value_t)]
     pub log_format: LogFormat,
@@ -93,7 +96,7 @@ pub async fn run_as(args: ServeArgs, instead: Option<Routes>) -> Result<(), Serv
         metrics::publish(args.allowed(address, "--metrics")?)?;
     }
     files::allow(config.limits.connections);
-    let sockets = args.bind(&config)?;
+    let mut sockets = args.bind(&config)?;
     if let Some(directory) = &args.data {
         config.journal = open(directory)?;
     }
@@ -102,6 +105,8 @@ pub async fn run_as(args: ServeArgs, instead: Option<Routes>) -> Result<(), Serv
         // Nobody may read it; that is no reason not to serve.
         let _ = writeln!(std::io::stdout(), "listening on {}", socket.address());
     }
+    // Clients are not told of it.
+    sockets.extend(args.health.map(bind_health).transpose()?);
     let shutdown = async move {
         tokio::select! {
             _ = interrupt.recv() => (),
@@ -178,6 +183,9 @@ impl ServeArgs {
             let encrypted = config.tls.is_some() && matches!(socket.address(), Listen::Tcp(_));
             let how = if encrypted { "TLS" } else { "not encrypted" };
             would.push(format!("would listen on {}, {how}", socket.address()));
+        }
+        if let Some(address) = self.health {
+            would.push(format!("health on {}, not encrypted", bind_health(address)?.address()));
         }
         would.push(match config.tokens.names() {
             names if names.is_empty() => "no tokens: whoever can connect may read and change everything".into(),

@@ -87,6 +87,8 @@ pub struct Bound {
 #[derive(Debug)]
 pub(crate) enum Socket {
     Tcp(TcpListener),
+    /// For calls of health alone.
+    Health(TcpListener),
     Unix(UnixListener, SocketFile),
 }
 
@@ -111,25 +113,38 @@ pub fn bind(listen: &Listen, open: bool) -> Result<Bound, ServeError> {
              --token-file, use a loopback address or a Unix socket, or say --insecure"
         )));
     }
-    let failed = |error: io::Error| match error.kind() {
-        io::ErrorKind::AddrInUse | io::ErrorKind::PermissionDenied => {
-            ServeError::Failed(format!("cannot listen on {listen}: {error}"))
-        }
-        _ => ServeError::Usage(format!("cannot listen on {listen}: {error}")),
-    };
     match listen {
-        Listen::Tcp(address) => bind_tcp(*address),
+        Listen::Tcp(address) => bind_tcp(*address, Socket::Tcp),
         Listen::Unix(path) => bind_unix(path),
     }
-    .map_err(failed)
+    .map_err(|error| cannot(listen, &error))
 }
 
-fn bind_tcp(address: SocketAddr) -> io::Result<Bound> {
+/// Binds a socket that answers calls of health alone, unencrypted: whoever connects learns only whether the server is
+/// ready, and changes nothing.
+///
+/// Must be called within a tokio runtime.
+///
+/// # Errors
+/// As [`bind`].
+pub fn bind_health(address: SocketAddr) -> Result<Bound, ServeError> {
+    bind_tcp(address, Socket::Health).map_err(|error| cannot(&Listen::Tcp(address), &error))
+}
+
+fn cannot(listen: &Listen, error: &io::Error) -> ServeError {
+    let said = format!("cannot listen on {listen}: {error}");
+    match error.kind() {
+        io::ErrorKind::AddrInUse | io::ErrorKind::PermissionDenied => ServeError::Failed(said),
+        _ => ServeError::Usage(said),
+    }
+}
+
+fn bind_tcp(address: SocketAddr, of: fn(TcpListener) -> Socket) -> io::Result<Bound> {
     let listener = std::net::TcpListener::bind(address)?;
     listener.set_nonblocking(true)?;
     let listener = TcpListener::from_std(listener)?;
     let address = Listen::Tcp(listener.local_addr()?);
-    Ok(Bound { socket: Socket::Tcp(listener), address })
+    Ok(Bound { socket: of(listener), address })
 }
 
 fn bind_unix(path: &Path) -> io::Result<Bound> {

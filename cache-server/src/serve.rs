@@ -124,6 +124,21 @@ impl Node {
         Ok(Self { store, board, door, gate, health: Arc::default(), tls, instead, calls })
     }
 
+    /// What clients call, beside health.
+    fn services(&self) -> Result<Routes, BoxError> {
+        let services = self.instead.clone().unwrap_or_else(|| {
+            let cache = CacheServer::new(CacheService::new(self.store.clone(), self.board.clone()));
+            let frames = FramesServer::new(FramesService::new(self.board.clone()));
+            Routes::new(cache.max_decoding_message_size(CACHE_MESSAGE_MAX))
+                .add_service(frames.max_decoding_message_size(FRAMES_MESSAGE_MAX))
+        });
+        let reflection = tonic_reflection::server::Builder::configure()
+            .register_encoded_file_descriptor_set(cache_proto::DESCRIPTORS)
+            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+            .build_v1()?;
+        Ok(services.add_service(reflection))
+    }
+
     /// Takes back lost leases, and tells how things stand, for ever.
     pub async fn tick(&self) -> Infallible {
         let mut ticks = tokio::time::interval(TICK);
@@ -162,11 +177,13 @@ where
     I: Stream<Item = io::Result<IO>>,
     IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
 {
-    serve_encrypted(node, None, incoming, shutdown).await
+    let services = node.services()?;
+    serve_routes(node, services, None, incoming, shutdown).await
 }
 
-async fn serve_encrypted<I, IO>(
+async fn serve_routes<I, IO>(
     node: Node,
+    services: Routes,
     tls: Option<Tls>,
     incoming: I,
     shutdown: impl Future<Output = ()>,
@@ -175,17 +192,7 @@ where
     I: Stream<Item = io::Result<IO>>,
     IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
 {
-    let services = node.instead.clone().unwrap_or_else(|| {
-        let cache = CacheServer::new(CacheService::new(node.store.clone(), node.board.clone()));
-        let frames = FramesServer::new(FramesService::new(node.board.clone()));
-        Routes::new(cache.max_decoding_message_size(CACHE_MESSAGE_MAX))
-            .add_service(frames.max_decoding_message_size(FRAMES_MESSAGE_MAX))
-    });
     node.health.tell(node.store.works()).await;
-    let reflection = tonic_reflection::server::Builder::configure()
-        .register_encoded_file_descriptor_set(cache_proto::DESCRIPTORS)
-        .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
-        .build_v1()?;
     let mut server = Server::builder();
     if let Some(tls) = &tls {
         server = server.tls_config(tls.config().clone())?;
@@ -200,9 +207,7 @@ where
         .http2_max_pending_accept_reset_streams(Some(RESETS_MAX))
         .http2_max_local_error_reset_streams(Some(RESETS_MAX))
         .layer(node.gate)
-        .add_routes(services)
-        .add_service(node.health.service())
-        .add_service(reflection)
+        .add_routes(services.add_service(node.health.service()))
         .serve_with_incoming_shutdown(node.door.guests(incoming), shutdown)
         .await?;
     Ok(())
@@ -251,8 +256,12 @@ async fn serve_socket(node: Node, socket: Socket, mut stopped: watch::Receiver<b
     };
     match socket {
         Socket::Tcp(listener) => {
-            let tls = node.tls.clone();
-            serve_encrypted(node, tls, TcpIncoming::from(listener).with_nodelay(Some(true)), shutdown).await
+            let (services, tls) = (node.services()?, node.tls.clone());
+            let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
+            serve_routes(node, services, tls, incoming, shutdown).await
+        }
+        Socket::Health(listener) => {
+            serve_routes(node, Routes::default(), None, TcpIncoming::from(listener), shutdown).await
         }
         Socket::Unix(listener, _file) => serve_on(node, UnixListenerStream::new(listener), shutdown).await,
     }
