@@ -8,6 +8,9 @@ use tonic_health::server::{HealthReporter, HealthService};
 /// What is reported on: the server as a whole, and each service.
 const SERVICES: [&str; 3] = ["", "ambience.v1.Cache", "ambience.v1.Frames"];
 
+/// The health service itself serves whenever it answers: a full disk is no reason to start a server again.
+const ALIVE: &str = "grpc.health.v1.Health";
+
 /// The health of one server, on all its sockets.
 #[derive(Debug, Default)]
 pub struct Health {
@@ -31,12 +34,13 @@ impl Health {
         for service in SERVICES {
             self.reporter.set_service_status(service, status).await;
         }
+        self.reporter.set_service_status(ALIVE, ServingStatus::Serving).await;
     }
 
     /// Tells that the server is going away, and sends away those who watch.
     pub async fn close(&self) {
         self.tell(false).await;
-        for service in SERVICES {
+        for service in SERVICES.into_iter().chain([ALIVE]) {
             self.reporter.clone().clear_service_status(service).await;
         }
     }

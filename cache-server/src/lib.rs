@@ -68,5 +68,5 @@ pub mod files;
 
 pub use cli::{ServeArgs, run, run_as};
 pub use limits::Limits;
-pub use listen::{Bound, Listen, ServeError, bind};
+pub use listen::{Bound, Listen, ServeError, bind, bind_health};
 pub use serve::{Config, Node, serve, serve_on};

@@ -10,11 +10,12 @@ use cache_core::Namespace;
 use cache_proto::v1;
 use cache_server::access::Tokens;
 use cache_server::tls::Tls;
-use cache_server::{Config, clock};
+use cache_server::{Config, bind_health, clock};
 use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair, date_time_ymd};
 use support::{Server, insert, soon, subscribe, with_token};
 use tonic::transport::{Certificate, Channel, ClientTlsConfig};
 use tonic::{Code, Status};
+use tonic_health::ServingStatus;
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_client::HealthClient;
 
@@ -165,6 +166,20 @@ async fn plain_text_to_a_tls_port_is_cut_and_costs_nobody_else_anything() {
         assert!(info(&plain, Some(LIGHT)).await.is_err());
     }
     assert!(info(&channel, Some(LIGHT)).await.is_ok());
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn an_address_for_health_needs_no_tls_and_answers_nothing_else() {
+    let authority = Authority::new();
+    let [certificate, key] = authority.sign("127.0.0.1", (2100, 1));
+    let tls = Tls::load(&certificate, &key, clock::date()).expect("sound");
+    let config = Config { tls: Some(tls), tokens: tokens(authority.folder.path()), ..Config::default() };
+    let server = Server::start_on(bind_health("127.0.0.1:0".parse().expect("an address")).expect("bound"), config);
+    let plain = soon(server.endpoint().connect()).await.expect("no TLS");
+    let told = soon(HealthClient::new(plain.clone()).check(HealthCheckRequest::default())).await.expect("told");
+    assert_eq!(told.into_inner().status, ServingStatus::Serving as i32);
+    assert_eq!(info(&plain, Some(LIGHT)).await.expect_err("not here").code(), Code::Unimplemented);
     server.stop().await;
 }
 

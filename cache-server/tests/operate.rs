@@ -212,8 +212,8 @@ async fn health_is_told_by_the_journal() {
     let full = Arc::new(AtomicBool::new(false));
     let server = support::Server::start(Config { journal: Box::new(Full(full.clone())), ..Config::default() });
     let (mut cache, watch) = (server.cache(), HealthCheckRequest { service: "ambience.v1.Cache".into() });
-    let mut health = HealthClient::new(soon(server.endpoint().connect()).await.expect("connected"));
-    let mut health = soon(health.watch(watch)).await.expect("known").into_inner();
+    let mut asked = HealthClient::new(soon(server.endpoint().connect()).await.expect("connected"));
+    let mut health = soon(asked.watch(watch)).await.expect("known").into_inner();
     let mut expect = async |status: ServingStatus| {
         let told = soon(health.message()).await.expect("no error").expect("no end");
         assert_eq!(told.status, status as i32);
@@ -223,6 +223,10 @@ async fn health_is_told_by_the_journal() {
     let refused = soon(cache.insert(insert(Namespace([5; 32]), 0..9))).await.expect_err("full");
     assert_eq!(refused.code(), Code::Unavailable, "{refused}");
     expect(ServingStatus::NotServing).await;
+    // It is alive all the same.
+    let alive = HealthCheckRequest { service: "grpc.health.v1.Health".into() };
+    let told = soon(asked.check(alive)).await.expect("known").into_inner();
+    assert_eq!(told.status, ServingStatus::Serving as i32);
     full.store(false, Ordering::Relaxed);
     soon(cache.insert(insert(Namespace([5; 32]), 0..9))).await.expect("room again");
     expect(ServingStatus::Serving).await;
