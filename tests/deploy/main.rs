@@ -5,6 +5,9 @@
 #[path = "../processes/mod.rs"]
 mod processes;
 
+mod compose;
+mod container;
+mod kubernetes;
 mod openjd;
 mod slurm;
 mod systemd;
@@ -20,19 +23,22 @@ type Test = (&'static str, Result<Box<dyn FnOnce() + Send>, String>);
 fn main() {
     let arguments = Arguments::from_args();
     let [preempted, lost] = slurm::tests();
-    let trials = [openjd::test(), preempted, lost, systemd::test()].map(|(name, test): Test| match test {
-        Ok(run) => Trial::test(name, move || {
-            let ran = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run));
-            ran.map_err(|panic| {
-                let said = panic.downcast_ref::<String>().cloned();
-                Failed::from(said.unwrap_or_else(|| "it panicked".into()))
-            })
-        }),
-        Err(why) => {
-            eprintln!("tests/deploy: {name} is skipped: {why}");
-            Trial::test(name, || Ok(())).with_ignored_flag(true)
-        }
-    });
+    let [image, manifests] = [container::test(), kubernetes::test()];
+    let trials = [compose::test(), image, manifests, openjd::test(), preempted, lost, systemd::test()].map(
+        |(name, test): Test| match test {
+            Ok(run) => Trial::test(name, move || {
+                let ran = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run));
+                ran.map_err(|panic| {
+                    let said = panic.downcast_ref::<String>().cloned();
+                    Failed::from(said.unwrap_or_else(|| "it panicked".into()))
+                })
+            }),
+            Err(why) => {
+                eprintln!("tests/deploy: {name} is skipped: {why}");
+                Trial::test(name, || Ok(())).with_ignored_flag(true)
+            }
+        },
+    );
     libtest_mimic::run(&arguments, trials.into()).exit();
 }
 
@@ -61,6 +67,27 @@ fn run(command: &mut Command) -> String {
     let said = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat();
     assert!(output.status.success(), "{command:?}: {}\n{said}", output.status);
     said
+}
+
+/// Whether this build takes these arguments: what keeps it from going on is only that `missing` is not on this machine.
+fn takes(arguments: &[String], environment: &[(&str, &str)], missing: &str) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ambience"));
+    let output = command.args(arguments).envs(environment.iter().copied()).output().expect("it starts");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(2) && said.contains(missing), "{arguments:?}: {said}");
+}
+
+/// The documents of a file: as they are written, for the types that read them to be compared with.
+fn documents(text: &str) -> Vec<serde_json::Value> {
+    let documents = serde_norway::Deserializer::from_str(text);
+    documents.map(|document| serde::Deserialize::deserialize(document).expect("a document")).collect()
+}
+
+/// What is written, as the type says. A type that ignores what it does not know would lose it.
+fn typed<T: serde::de::DeserializeOwned + serde::Serialize>(written: &serde_json::Value) -> T {
+    let read: T = serde_json::from_value(written.clone()).unwrap_or_else(|error| panic!("{error}: {written}"));
+    assert_eq!(&serde_json::to_value(&read).expect("JSON"), written, "not all of it is known");
+    read
 }
 
 /// A scene with two views, in `folder`.
