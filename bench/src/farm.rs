@@ -20,6 +20,7 @@ use worker::job::Known;
 use worker::traffic::Traffic;
 
 use crate::host::{self, Host, Kind, Usage};
+use crate::relay::Relay;
 use crate::report::{Curve, Report, curves, quantile};
 use crate::work::{self, Pretended, lock, watch};
 
@@ -37,6 +38,9 @@ pub struct FarmArgs {
     /// Mean time of one gather, microseconds
     #[arg(long, default_value_t = 16000)]
     gather: u32,
+    /// Relays between the workers and the server, each with an equal share of them
+    #[arg(long, default_value_t = 0)]
+    relays: usize,
     /// Width of the picture; its height is 9/16 of that
     #[arg(long, default_value_t = 960)]
     width: u32,
@@ -52,9 +56,10 @@ pub struct FarmArgs {
 pub fn run(args: &FarmArgs) -> Result<(), Box<dyn Error>> {
     let sizes: Vec<_> = args.workers.iter().map(u32::to_string).collect();
     let command = format!(
-        "cargo run --release -p ambience-bench -- farm {} --gather {} --width {}",
+        "cargo run --release -p ambience-bench -- farm {} --gather {} --relays {} --width {}",
         sizes.join(" "),
         args.gather,
+        args.relays,
         args.width
     );
     let mut report = Report::begin(&command);
@@ -82,6 +87,10 @@ pub fn run(args: &FarmArgs) -> Result<(), Box<dyn Error>> {
     for &workers in &args.workers {
         let run = frame(args, workers)?;
         report.line(&run.to_string());
+        if args.relays > 0 {
+            let Usage { cpu, peak } = run.relay;
+            report.line(&format!("        a relay took {cpu:.1} CPU s and {:.0} MB at its peak", peak / 1e6));
+        }
         runs.push(run);
     }
     if let Some(name) = &args.save {
@@ -108,6 +117,8 @@ struct Run {
     /// Bytes of records each worker received.
     received: f64,
     server: Usage,
+    /// Mean CPU of the relays, and the most memory of one.
+    relay: Usage,
     clients: f64,
 }
 
@@ -152,6 +163,7 @@ fn frame(args: &FarmArgs, workers: u32) -> Result<Run, Box<dyn Error>> {
     lock(&watch().replicas).clear();
     lock(&watch().watched).clear();
     let mut host = Host::start(Kind::Memory, 0, 1)?;
+    let relays = (0..args.relays).map(|_| Relay::start(&host.address())).collect::<Result<Vec<_>, _>>()?;
     // One thread for the protocol, few for keeping records: the machine is the server's, too.
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(1).max_blocking_threads(2).enable_all().build()?;
@@ -160,8 +172,9 @@ fn frame(args: &FarmArgs, workers: u32) -> Result<Run, Box<dyn Error>> {
     let (over, visible) = look();
     let result = runtime.block_on(async {
         for number in 0..workers {
-            let worker =
-                Arc::new(Worker::<Pretended>::new(format!("simulated-{number}"), host.connect(), Traffic::default()));
+            let relay = (number as usize).checked_rem(relays.len()).map(|at| &relays[at]);
+            let line = relay.map_or_else(|| host.connect(), Relay::connect);
+            let worker = Arc::new(Worker::<Pretended>::new(format!("simulated-{number}"), line, Traffic::default()));
             tokio::spawn(async move {
                 let lost = worker.work(1).await;
                 eprintln!("simulated-{number}: {lost}");
@@ -214,8 +227,18 @@ fn frame(args: &FarmArgs, workers: u32) -> Result<Run, Box<dyn Error>> {
         received: count("bytes.subscribed") / f64::from(workers),
         done,
         server,
+        relay: mean(&relays)?,
         clients,
     })
+}
+
+fn mean(relays: &[Relay]) -> Result<Usage, Box<dyn Error>> {
+    let mut all = Usage::default();
+    for relay in relays {
+        let Usage { cpu, peak } = relay.usage()?;
+        all = Usage { cpu: all.cpu + cpu / relays.len() as f64, peak: all.peak.max(peak) };
+    }
+    Ok(all)
 }
 
 /// Looks into every replica for the records that are watched, until told that the frame is over; then tells how many

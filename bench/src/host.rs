@@ -89,6 +89,11 @@ impl Host {
         Ok(host)
     }
 
+    /// Where it listens.
+    pub fn address(&self) -> String {
+        format!("unix:{}", socket(self.folder.path()).display())
+    }
+
     /// A new connection.
     pub fn connect(&self) -> Line {
         let path = socket(self.folder.path());
@@ -127,10 +132,15 @@ fn socket(folder: &Path) -> PathBuf {
 pub fn usage() -> Result<Usage, nix::Error> {
     let usage = getrusage(UsageWho::RUSAGE_SELF)?;
     // Linux counts the parent's memory into `max_rss` from before the program was its own.
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:")?.trim().strip_suffix(" kB")?.parse().ok());
-    let peak = peak.map_or(usage.max_rss() as f64, |kilobytes: f64| kilobytes * 1024.0);
+    let peak = peak("self").unwrap_or(usage.max_rss() as f64);
     Ok(Usage { cpu: seconds(&usage), peak })
+}
+
+/// Most memory of a process that was resident, bytes, by its name in /proc.
+pub(crate) fn peak(process: &str) -> Option<f64> {
+    let status = std::fs::read_to_string(format!("/proc/{process}/status")).ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")?.trim().strip_suffix(" kB"))?;
+    line.parse().ok().map(|kilobytes: f64| kilobytes * 1024.0)
 }
 
 /// CPU seconds of the children of this process that have ended, and of those they waited for.

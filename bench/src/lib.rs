@@ -21,6 +21,7 @@
 //! - [`bare`]: the cache service with nothing behind it.
 //! - [`host`]: a server in a process of its own.
 //! - [`service`]: records in and out, queries and latency, as ratios to the bare stream.
+//! - [`relay`]: what a relay costs, beside the same without one.
 //! - [`splat`]: records drawn by a graphics adapter, against the octree.
 //! - [`plane`]: a hemisphere seen through a plane: weights of its pixels, and what draws it, in Rust.
 //! - [`glow`]: what surfaces send out, kept on their triangles.
@@ -61,6 +62,7 @@ pub mod rasteriser;
 pub mod bare;
 pub mod host;
 pub mod records;
+pub mod relay;
 pub mod service;
 
 pub mod farm;

@@ -4,7 +4,7 @@ use std::error::Error;
 
 use ambience_bench::host::HostArgs;
 use ambience_bench::{
-    asked, details, farm, gloss, host, lamps, lookups, peers, pictures, rasterise, rays, service, splat, start,
+    asked, details, farm, gloss, host, lamps, lookups, peers, pictures, rasterise, rays, relay, service, splat, start,
 };
 use clap::{Parser, Subcommand};
 
@@ -43,6 +43,8 @@ enum Command {
     Start(start::StartArgs),
     /// The cache service against the bare stream under it
     Service(service::ServiceArgs),
+    /// What a relay costs, beside the same without one
+    Relay(relay::RelayArgs),
     /// One frame by simulated farms of many sizes
     Farm(farm::FarmArgs),
     /// The server's side of the other two
@@ -65,6 +67,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         Some(Command::Peers(args)) => peers::run(&args),
         Some(Command::Start(args)) => start::run(&args),
         Some(Command::Service(args)) => service::run(&args),
+        Some(Command::Relay(args)) => relay::run(&args),
         Some(Command::Farm(args)) => farm::run(&args),
         Some(Command::Host(args)) => host::serve(&args),
     }

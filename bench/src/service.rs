@@ -152,7 +152,11 @@ async fn insert(
     Ok(())
 }
 
-async fn send(cache: &mut Cache, batches: Vec<v1::RecordBatch>) -> Result<v1::InsertResponse, tonic::Status> {
+/// Inserts batches in one call.
+pub(crate) async fn send(
+    cache: &mut Cache,
+    batches: Vec<v1::RecordBatch>,
+) -> Result<v1::InsertResponse, tonic::Status> {
     let requests = tokio_stream::iter(batches.into_iter().map(|batch| v1::InsertRequest { batch: Some(batch) }));
     Ok(cache.insert(requests).await?.into_inner())
 }
@@ -201,7 +205,7 @@ async fn subscribe(
 }
 
 /// Subscribes, and hears where the stream starts.
-async fn follow(
+pub(crate) async fn follow(
     cache: &mut Cache,
     namespace: &Namespace,
     position: u64,
@@ -213,7 +217,8 @@ async fn follow(
     Ok(stream)
 }
 
-async fn read(mut stream: Streaming<v1::SubscribeResponse>, count: u64) -> Result<(), tonic::Status> {
+/// Reads so many records.
+pub(crate) async fn read(mut stream: Streaming<v1::SubscribeResponse>, count: u64) -> Result<(), tonic::Status> {
     let mut bytes = 0;
     while bytes < count as usize * 128
         && let Some(response) = stream.message().await?
@@ -266,31 +271,36 @@ async fn latency(report: &mut Report, load: bool) -> Result<(), Box<dyn Error>> 
     let mut bare = f64::NAN;
     for (kind, name) in KINDS.into_iter().filter(|(kind, _)| !matches!(kind, Kind::Keep | Kind::Write)) {
         let host = Host::start(kind, 0, 1)?;
-        let mut cache = client::cache(host.connect());
         let position = if kind == Kind::Bare { LIVE } else { 0 };
-        let mut stream = follow(&mut client::cache(host.connect()), &NAMESPACE, position).await?;
         let loading = load.then(|| tokio::spawn(busy(client::cache(host.connect()))));
-        let mut every = tokio::time::interval(PING_EVERY);
-        every.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut times = Vec::new();
-        for batch in records::batches(&NAMESPACE, PINGS as u64 * PING_RECORDS, PING_RECORDS) {
-            every.tick().await;
-            let start = Instant::now();
-            let (seen, kept) = tokio::join!(stream.message(), send(&mut cache, vec![batch]));
-            kept?;
-            seen?.ok_or("the subscription has ended")?;
-            times.push(start.elapsed().as_secs_f64() * 1e6);
-        }
+        let [caller, subscriber] = [(); 2].map(|()| client::cache(host.connect()));
+        let [p50, p99] = pings(caller, subscriber, position).await?;
         if let Some(loading) = loading {
             loading.abort();
         }
-        let (p50, p99) = (quantile(&mut times, 0.5), quantile(&mut times, 0.99));
         if kind == Kind::Bare {
             bare = p50;
         }
         report.line(&format!("{name:28} {p50:10.0} {p99:10.0} {:10.0}", p50 - bare));
     }
     Ok(())
+}
+
+/// Microseconds, p50 and p99, until a subscriber has what a caller inserts.
+pub(crate) async fn pings(mut caller: Cache, mut subscriber: Cache, position: u64) -> Result<[f64; 2], Box<dyn Error>> {
+    let mut stream = follow(&mut subscriber, &NAMESPACE, position).await?;
+    let mut every = tokio::time::interval(PING_EVERY);
+    every.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut times = Vec::new();
+    for batch in records::batches(&NAMESPACE, PINGS as u64 * PING_RECORDS, PING_RECORDS) {
+        every.tick().await;
+        let start = Instant::now();
+        let (seen, kept) = tokio::join!(stream.message(), send(&mut caller, vec![batch]));
+        kept?;
+        seen?.ok_or("the subscription has ended")?;
+        times.push(start.elapsed().as_secs_f64() * 1e6);
+    }
+    Ok([0.5, 0.99].map(|q| quantile(&mut times, q)))
 }
 
 /// Inserts in another namespace until it is stopped.
