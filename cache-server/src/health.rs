@@ -11,6 +11,9 @@ const SERVICES: [&str; 3] = ["", "ambience.v1.Cache", "ambience.v1.Frames"];
 /// The health service itself serves whenever it answers: a full disk is no reason to start a server again.
 const ALIVE: &str = "grpc.health.v1.Health";
 
+/// Largest message that asks, bytes: the name of a service.
+const MESSAGE_MAX: usize = 1 << 10;
+
 /// The health of one server, on all its sockets.
 #[derive(Debug, Default)]
 pub struct Health {
@@ -21,7 +24,8 @@ pub struct Health {
 impl Health {
     /// The service that tells it.
     pub fn service(&self) -> HealthServer<HealthService> {
-        HealthServer::new(HealthService::from_health_reporter(self.reporter.clone()))
+        let service = HealthService::from_health_reporter(self.reporter.clone());
+        HealthServer::new(service).max_decoding_message_size(MESSAGE_MAX)
     }
 
     /// Tells whether the server is ready; those who watch hear of changes only.

@@ -62,6 +62,9 @@ const HEADERS_MAX: u32 = 16 << 10;
 /// Calls that a client may take back before the server saw them, or spoil, at a time; one that does more is cut.
 const RESETS_MAX: usize = 64;
 
+/// Connections to an address for health alone.
+const PROBES_MAX: usize = 16;
+
 /// What a server is made of.
 pub struct Config {
     /// Bounds of what it keeps.
@@ -261,6 +264,8 @@ async fn serve_socket(node: Node, socket: Socket, mut stopped: watch::Receiver<b
             serve_routes(node, services, tls, incoming, shutdown).await
         }
         Socket::Health(listener) => {
+            // Probes must be answered also while clients have all connections, and cost them none.
+            let node = Node { door: Arc::new(Door::new(PROBES_MAX)), ..node };
             serve_routes(node, Routes::default(), None, TcpIncoming::from(listener), shutdown).await
         }
         Socket::Unix(listener, _file) => serve_on(node, UnixListenerStream::new(listener), shutdown).await,

@@ -8,11 +8,12 @@ use std::time::Duration;
 
 use cache_core::Namespace;
 use cache_proto::v1;
+use cache_proto::v1::frames_client::FramesClient;
 use cache_server::access::Tokens;
 use cache_server::tls::Tls;
 use cache_server::{Config, bind_health, clock};
 use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair, date_time_ymd};
-use support::{Server, insert, soon, subscribe, with_token};
+use support::{Bearer, Server, insert, soon, subscribe, with_token};
 use tonic::transport::{Certificate, Channel, ClientTlsConfig};
 use tonic::{Code, Status};
 use tonic_health::ServingStatus;
@@ -60,6 +61,14 @@ impl Authority {
         let [certificate, key] = self.sign(host, until);
         let tls = Tls::load(&certificate, &key, now).expect("sound");
         Server::start(Config { tls: Some(tls), tokens: tokens(self.folder.path()), ..Config::default() })
+    }
+
+    /// An address for health alone, of a server that wants TLS and tokens elsewhere.
+    fn serve_health(&self) -> Server {
+        let [certificate, key] = self.sign("127.0.0.1", (2100, 1));
+        let tls = Tls::load(&certificate, &key, clock::date()).expect("sound");
+        let config = Config { tls: Some(tls), tokens: tokens(self.folder.path()), ..Config::default() };
+        Server::start_on(bind_health("127.0.0.1:0".parse().expect("an address")).expect("bound"), config)
     }
 
     async fn connect(&self, server: &Server) -> Result<Channel, tonic::transport::Error> {
@@ -170,16 +179,53 @@ async fn plain_text_to_a_tls_port_is_cut_and_costs_nobody_else_anything() {
 }
 
 #[tokio::test]
-async fn an_address_for_health_needs_no_tls_and_answers_nothing_else() {
+async fn an_address_for_health_needs_no_tls_and_no_token_and_answers_nothing_else() {
     let authority = Authority::new();
-    let [certificate, key] = authority.sign("127.0.0.1", (2100, 1));
-    let tls = Tls::load(&certificate, &key, clock::date()).expect("sound");
-    let config = Config { tls: Some(tls), tokens: tokens(authority.folder.path()), ..Config::default() };
-    let server = Server::start_on(bind_health("127.0.0.1:0".parse().expect("an address")).expect("bound"), config);
+    let server = authority.serve_health();
     let plain = soon(server.endpoint().connect()).await.expect("no TLS");
-    let told = soon(HealthClient::new(plain.clone()).check(HealthCheckRequest::default())).await.expect("told");
+    let mut health = HealthClient::new(plain.clone());
+    let told = soon(health.check(HealthCheckRequest::default())).await.expect("told");
     assert_eq!(told.into_inner().status, ServingStatus::Serving as i32);
-    assert_eq!(info(&plain, Some(LIGHT)).await.expect_err("not here").code(), Code::Unimplemented);
+    for token in [None, Some(LIGHT)] {
+        let refused = [
+            info(&plain, token).await.expect_err("not here"),
+            soon(with_token(plain.clone(), token).insert(insert(NAMESPACE, 0..9))).await.expect_err("not here"),
+            soon(with_token(plain.clone(), token).subscribe(subscribe(NAMESPACE))).await.expect_err("not here"),
+        ];
+        for status in refused {
+            assert!(matches!(status.code(), Code::Unauthenticated | Code::Unimplemented), "{status}");
+        }
+    }
+    let mut frames = FramesClient::with_interceptor(plain.clone(), Bearer(Some(LIGHT.into())));
+    let refused = soon(frames.lease(v1::LeaseRequest::default())).await.expect_err("not here");
+    assert_eq!(refused.code(), Code::Unimplemented, "{refused}");
+    let reflection = tonic_reflection::pb::v1::server_reflection_client::ServerReflectionClient::with_interceptor(
+        plain.clone(),
+        Bearer(Some(LIGHT.into())),
+    );
+    let refused = soon({ reflection }.server_reflection_info(tokio_stream::empty())).await.expect_err("not here");
+    assert_eq!(refused.code(), Code::Unimplemented, "{refused}");
+    // Nothing can be brought to it, in a message or in many connections.
+    let large = HealthCheckRequest { service: "a".repeat(2000) };
+    let refused = soon(health.check(large)).await.expect_err("too large");
+    assert_eq!(refused.code(), Code::OutOfRange, "{refused}");
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn connections_to_an_address_for_health_are_bounded() {
+    let server = Authority::new().serve_health();
+    let mut kept = Vec::new();
+    for _ in 0..100 {
+        // Further ones are closed at once.
+        let Ok(channel) = soon(server.endpoint().connect()).await else { continue };
+        let mut health = HealthClient::new(channel);
+        if soon(health.check(HealthCheckRequest::default())).await.is_ok() {
+            kept.push(health);
+        }
+    }
+    // 16, and the 64 that are told of other calls that there are too many: health is told them.
+    assert_eq!(kept.len(), 80);
     server.stop().await;
 }
 
