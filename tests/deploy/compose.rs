@@ -11,6 +11,7 @@ pub fn test() -> Test {
 
 fn sound() {
     for container in containers() {
+        container.sees_its_files();
         // Each has a secret that is not there.
         takes(&container.arguments, &[], "/run/secrets/");
     }

@@ -26,6 +26,17 @@ pub struct Container {
     pub folder: Option<String>,
 }
 
+impl Container {
+    /// Holds that what the arguments name by its path is mounted.
+    pub fn sees_its_files(&self) {
+        for argument in &self.arguments {
+            let Some((_, path)) = argument.split_once("=/") else { continue };
+            let mounted = |mount: &Mount| Path::new("/").join(path).starts_with(&mount.target);
+            assert!(self.mounts.iter().any(mounted), "{argument}: nothing is mounted there");
+        }
+    }
+}
+
 /// A file or folder of the test's, by its name in the description, and where the container sees it.
 pub struct Mount {
     pub source: String,

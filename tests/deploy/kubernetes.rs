@@ -29,6 +29,7 @@ fn sound() {
     farm.is_reached();
     farm.is_closed_to_others();
     for container in farm.containers() {
+        container.sees_its_files();
         // What each mounts is not here.
         takes(&container.arguments, &[("AMBIENCE_TOKEN", "0123456789abcdef")], ": No such file");
     }
