@@ -62,7 +62,7 @@ const HEADERS_MAX: u32 = 16 << 10;
 /// Calls that a client may take back before the server saw them, or spoil, at a time; one that does more is cut.
 const RESETS_MAX: usize = 64;
 
-/// Connections to an address for health alone.
+/// Connections to an address for health alone, beside those past the bound: health answers them too.
 const PROBES_MAX: usize = 16;
 
 /// What a server is made of.
