@@ -35,7 +35,7 @@ pub struct DetailsArgs {
     /// How many seeds; medians are printed
     #[arg(long, default_value_t = 1)]
     seeds: u64,
-    /// In place of the table: for each detail the place where a picture without it errs most, into this folder
+    /// In place of the table: for each detail a place where a picture without it errs, into this folder
     #[arg(long, value_name = "DIR")]
     pictures: Option<PathBuf>,
 }
@@ -111,31 +111,51 @@ fn measure(frame: &Frame, truth: &Reference) -> Measured {
     Measured { records, filled: Filled { levels: Vec::new(), ..filled }, seconds, verdict }
 }
 
-/// Where each detail shows: the scene that breaks without it, the allowed error there, and what is done without it.
-fn shown() -> Vec<(&'static str, &'static str, f32, Details)> {
+/// Where a detail shows.
+struct Shown {
+    name: &'static str,
+    /// The scene that breaks without it.
+    scene: &'static str,
+    /// The allowed error there.
+    a: f32,
+    with: Details,
+    without: Details,
+    /// What is looked at; else where the picture without it errs most.
+    place: Option<[usize; 2]>,
+}
+
+fn shown() -> Vec<Shown> {
     let usual = Details::default();
+    let without = |name, scene, a, without| Shown { name, scene, a, with: usual, without, place: None };
     vec![
-        ("metric", "stairs.full", 0.4, Details { metric: Metric::SplitSphere, ..usual }),
-        ("neighbor-clamping", "stairs.full", 0.4, Details { neighbor_clamping: false, ..usual }),
-        ("translational-gradient", "cornell.full", 0.4, Details { gradients: Gradients::None, ..usual }),
-        ("rotational-gradient", "sphere-plane.full", 0.4, Details { rotation: false, ..usual }),
-        ("gradients-per-channel", "cornell.full", 0.4, Details { gradients_per_channel: false, ..usual }),
-        ("radius-by-gradient", "cornell.full", 0.4, Details { radius_by_gradient: false, ..usual }),
-        ("gradient-by-radius", "stairs.full", 0.2, Details { gradient_by_radius: false, ..usual }),
-        ("weights", "cornell.full", 0.4, Details { weighting: Weighting::Inverse, ..usual }),
-        ("distance", "leak.full", 0.4, Details { distance: Distance::Nearest, ..usual }),
-        ("spacing", "stairs.full", 0.2, Details { spacing: Spacing::World, ..usual }),
+        without("metric", "stairs.full", 0.4, Details { metric: Metric::SplitSphere, ..usual }),
+        without("neighbor-clamping", "stairs.full", 0.4, Details { neighbor_clamping: false, ..usual }),
+        without("translational-gradient", "cornell.full", 0.4, Details { gradients: Gradients::None, ..usual }),
+        without("rotational-gradient", "sphere-plane.full", 0.4, Details { rotation: false, ..usual }),
+        without("gradients-per-channel", "cornell.full", 0.4, Details { gradients_per_channel: false, ..usual }),
+        without("radius-by-gradient", "cornell.full", 0.4, Details { radius_by_gradient: false, ..usual }),
+        without("gradient-by-radius", "stairs.full", 0.2, Details { gradient_by_radius: false, ..usual }),
+        without("weights", "cornell.full", 0.4, Details { weighting: Weighting::Inverse, ..usual }),
+        without("distance", "leak.full", 0.4, Details { distance: Distance::Nearest, ..usual }),
+        without("spacing", "stairs.full", 0.2, Details { spacing: Spacing::World, ..usual }),
+        // The front of the tall block, where the top of the short one comes into sight.
+        Shown {
+            with: Details { adaptive: true, ..usual },
+            place: Some([30, 50]),
+            ..without("adaptive", "cornell.full", 0.25, usual)
+        },
     ]
 }
 
-/// One picture for each detail, DIR/NAME.png: reference, with it, without it, where the last errs most; and a line.
+/// One picture for each detail, DIR/NAME.png: reference, with it, without it, and how much brighter or darker than the reference
+/// these two are, white and black being 5 %; and a line.
 fn pictures(args: &DetailsArgs, folder: &Path) -> Result<(), Box<dyn Error>> {
     std::fs::create_dir_all(folder)?;
     println!(
         "128x128, --rays {} --spp {}; with -> without: records of level 1, RMSE, worst block",
         args.rays, args.spp
     );
-    for (name, scene, a, without) in shown() {
+    for Shown { name, scene, a, with, without, place } in shown() {
         if args.only.as_ref().is_some_and(|only| !name.contains(only.as_str())) {
             continue;
         }
@@ -150,7 +170,7 @@ fn pictures(args: &DetailsArgs, folder: &Path) -> Result<(), Box<dyn Error>> {
             let verdict = judge(&image, &truth);
             (image, levels.first().map_or(0, |level| level.len()), verdict)
         };
-        let (with, without) = (render(Details::default()), render(without));
+        let (with, without) = (render(with), render(without));
         let percent = |v: f64| 100.0 * v;
         println!(
             "{name:24} {scene:18} a {a} {:6} -> {:6}  {:5.2} % -> {:5.2} %  {:5.2} % -> {:5.2} %",
@@ -161,11 +181,11 @@ fn pictures(args: &DetailsArgs, folder: &Path) -> Result<(), Box<dyn Error>> {
             percent(with.2.worst),
             percent(without.2.worst),
         );
-        let place = without.2.place.map(|at| at.saturating_sub(CROP / 2 - 4).min(SIZE - CROP));
-        let strip = Strip { place, crop: CROP, enlarged: ENLARGED };
-        strip
-            .of(&[&truth.image, &with.0, &without.0].map(|picture| Panel::Light(picture, 1.0)))
-            .save(folder.join(format!("{name}.png")))?;
+        let worst = without.2.place.map(|at| at.saturating_sub(CROP / 2 - 4).min(SIZE - CROP));
+        let strip = Strip { place: place.unwrap_or(worst), crop: CROP, enlarged: ENLARGED };
+        let lights = [&truth.image, &with.0, &without.0].map(|picture| Panel::Light(picture, 1.0));
+        let off = [&with.0, &without.0].map(|picture| Panel::Difference(picture, &truth.image, 0.05));
+        strip.of(&lights.into_iter().chain(off).collect::<Vec<_>>()).save(folder.join(format!("{name}.png")))?;
     }
     Ok(())
 }
