@@ -46,9 +46,28 @@ pub struct Mount {
 
 pub fn test() -> Test {
     // `sh` and `tar` are everywhere.
-    let tools = ["cargo", "buildah", "bwrap"].into_iter().try_for_each(needs);
+    let tools = ["cargo", "buildah", "bwrap"].into_iter().try_for_each(needs).and_then(|()| may());
     ("image_runs_shut_in_and_makes_the_same_picture", tools.map(|()| Box::new(image) as _))
 }
+
+/// Whether this machine lets builder and namespaces work at all: within some containers it does not.
+fn may() -> Result<(), String> {
+    let folder = tempfile::tempdir().expect("a folder");
+    let [graph, runs] = ["graph", "runs"].map(|name| folder.path().join(name));
+    let (mut builder, mut namespaces) = (Command::new("buildah"), Command::new("bwrap"));
+    builder.args(["--storage-driver", "vfs", "--root"]).arg(graph).arg("--runroot").arg(runs).args(["from", "scratch"]);
+    namespaces.args(NETWORK).arg("true");
+    for command in [&mut builder, &mut namespaces] {
+        let output = command.output().map_err(|e| e.to_string())?;
+        if !output.status.success() {
+            return Err(format!("{command:?}: {}", String::from_utf8_lossy(&output.stderr).trim()));
+        }
+    }
+    Ok(())
+}
+
+/// A network of their own for processes that see all files.
+const NETWORK: [&str; 6] = ["--unshare-user", "--unshare-net", "--dev-bind", "/", "/", "--die-with-parent"];
 
 fn image() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -122,8 +141,7 @@ fn farm(folder: &Path, root: &Path, [server, worker, render]: [Container; 3]) {
          kill $worker; wait $worker || exit 8
          kill $server; wait $server || exit 7"
     );
-    let network = ["--unshare-user", "--unshare-net", "--dev-bind", "/", "/", "--die-with-parent"];
-    run(Command::new("bwrap").args(network).args(["sh", "-c", &script]));
+    run(Command::new("bwrap").args(NETWORK).args(["sh", "-c", &script]));
 }
 
 /// The command that starts a container.
