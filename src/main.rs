@@ -74,7 +74,7 @@ enum Command {
     /// Watch a picture while its records come in
     ///
     /// Draws what a server knows of the scene, seen by any camera, with a GPU or Mesa's lavapipe, and writes it to OUT.png every few
-    /// seconds while there is something new. Where no record answers yet, one path a pixel does.
+    /// seconds while there is something new. Where no record answers yet, those around are asked as if they reached farther.
     Splat(splat::SplatArgs),
     /// Compare a picture with a reference
     ///
