@@ -11,6 +11,7 @@ use cache_proto::v1::frame_event::Event;
 use cache_proto::{convert, v1};
 
 use crate::access::Tenant;
+use crate::expected::Expected;
 use crate::frames::LEASE_TIME;
 use crate::metrics;
 use crate::refusal::Refusal;
@@ -23,14 +24,6 @@ pub const UNDELIVERED_MAX: usize = 64 << 20;
 
 /// Most bytes of tiles one `Complete` brings, so that it fits a message; one tile always does.
 const COMPLETE_BYTES_MAX: usize = 4 << 20;
-
-/// A lease is this fraction of an equal share of what is pending: large at first, small near the end, so that all
-/// workers finish a step together (guided self-scheduling).
-const SHARES: u32 = 4;
-
-/// What a lease should take at least, as far as those done tell: a small part of that is spent on giving it out. Where
-/// a whole step is little work, some of many workers get none of it.
-const LEASE_LEAST: Duration = Duration::from_millis(10);
 
 /// Most reasons of workers that wait for the owner; more are dropped, the first ones say enough.
 const DECLINES_MAX: usize = 64;
@@ -141,19 +134,19 @@ impl Frame {
         self.round.as_ref()
     }
 
-    /// Leases tiles to a worker, one of `workers`. `None` when there is nothing for it now.
-    pub fn lease(&mut self, lease: u64, worker: &Arc<str>, workers: u32, now: Duration) -> Option<v1::Lease> {
+    /// Workers that cannot do it.
+    pub fn unfit(&self) -> impl Iterator<Item = &Arc<str>> {
+        self.unfit.iter()
+    }
+
+    /// Leases tiles to a worker that can do it, for one of the `threads` of all of them. `None` when there is nothing for it now.
+    pub fn lease(&mut self, lease: u64, worker: &Arc<str>, threads: u32, now: Duration) -> Option<v1::Lease> {
         if self.unfit.contains(worker) {
             return None;
         }
         let room = self.room();
-        let fit = workers.saturating_sub(self.unfit.len() as u32).max(1);
         let round = self.round.as_mut()?;
-        let pending = round.pending_tiles();
-        let least = round.tiles_in(LEASE_LEAST);
-        let share = (pending / fit.saturating_mul(SHARES)).max(least).max(1);
-        let tiles =
-            (room > 0).then(|| round.grant(lease, worker.clone(), share.min(room), now, now + LEASE_TIME))??;
+        let tiles = (room > 0).then(|| round.grant(lease, worker.clone(), threads, room, now, now + LEASE_TIME))??;
         let step = Some(round.step().clone());
         Some(v1::Lease { id: lease, frame: self.id, step, tile_from: tiles.start, tile_to: tiles.end })
     }
@@ -233,10 +226,11 @@ impl Frame {
     }
 
     fn advance(&mut self, gathered: u64, mark: impl FnOnce(u32) -> Mark) {
+        let expected = self.round.take().map_or_else(|| Expected::nothing(self.job.tiles), Round::into_expected);
         self.round = self.plan.next(gathered).map(|step| {
             let mark = mark(self.steps);
             let step = convert::step(self.steps, &step, mark.position, mark.sum.digest);
-            Round::new(step, &self.job)
+            Round::new(step, &self.job, expected)
         });
         if let Some(round) = &self.round {
             self.steps += 1;

@@ -52,9 +52,16 @@ pub struct Frames {
     /// Oldest first, because numbers count up.
     frames: BTreeMap<u64, Frame>,
     /// When each worker was last heard of.
-    workers: BTreeMap<Arc<str>, Duration>,
+    workers: BTreeMap<Arc<str>, Heard>,
     next: u64,
     changes: Changes,
+}
+
+/// When a worker was heard of last, and how many leases it works on at a time.
+#[derive(Clone, Copy, Debug)]
+struct Heard {
+    at: Duration,
+    threads: u32,
 }
 
 /// Tells the state of a draft, as far as the steps before the given one gathered it.
@@ -98,20 +105,32 @@ impl Frames {
         own.ok_or(Refusal::NoFrame(frame))
     }
 
-    /// Work for a tenant's worker, from the oldest frame that has some. `None`: nothing now, ask again after the next
+    /// Work for a thread of a tenant's worker that has so many (0 counts as 1), from the oldest frame that has some. `None`: nothing now, ask again after the next
     /// change.
     ///
     /// # Errors
     /// [`Refusal::Full`] when there are too many workers, or this one holds too many leases.
-    pub fn lease(&mut self, tenant: &Tenant, worker: &str, now: Duration) -> Result<Option<v1::Lease>, Refusal> {
+    pub fn lease(
+        &mut self,
+        tenant: &Tenant,
+        worker: &str,
+        threads: u32,
+        now: Duration,
+    ) -> Result<Option<v1::Lease>, Refusal> {
         let worker = self.hear(worker, now)?;
+        let threads = threads.clamp(1, self.limits.leases as u32);
+        self.workers.entry(worker.clone()).and_modify(|heard| heard.threads = threads);
         if self.frames.values().map(|frame| frame.held_by(&worker)).sum::<usize>() >= self.limits.leases {
             return Err(Refusal::Full { what: "leases of one worker", most: self.limits.leases });
         }
-        let workers = self.workers.len() as u32;
         let number = self.number();
+        let all = self.workers.values().map(|heard| heard.threads).fold(0, u32::saturating_add);
+        let threads = |worker: &Arc<str>| self.workers.get(worker).map_or(0, |heard| heard.threads);
         let mut own = self.frames.values_mut().filter(|frame| frame.origin().tenant == *tenant);
-        let lease = own.find_map(|frame| frame.lease(number, &worker, workers, now));
+        let lease = own.find_map(|frame| {
+            let unfit = frame.unfit().map(threads).fold(0, u32::saturating_add);
+            frame.lease(number, &worker, all.saturating_sub(unfit).max(1), now)
+        });
         if lease.is_some() {
             metrics::leased();
         }
@@ -121,7 +140,7 @@ impl Frames {
     /// A worker says that it lives: the leases it names get a new deadline. Returns the leases it still holds.
     pub fn renew(&mut self, worker: &str, leases: &BTreeSet<u64>, now: Duration) -> Vec<u64> {
         if let Some(heard) = self.workers.get_mut(worker) {
-            *heard = now;
+            heard.at = now;
         }
         self.frames.values_mut().flat_map(|frame| frame.renew(worker, leases, now + LEASE_TIME)).collect()
     }
@@ -132,7 +151,7 @@ impl Frames {
     /// What is unsound about the request; the worker keeps the lease then.
     pub fn complete(&mut self, request: v1::CompleteRequest, now: Duration, mark: impl Marks) -> Result<bool, Refusal> {
         if let Some(heard) = self.workers.get_mut(request.worker.as_str()) {
-            *heard = now;
+            heard.at = now;
         }
         let Some(frame) = self.frames.get_mut(&request.frame) else { return Ok(false) };
         let (number, draft) = (request.frame, frame.origin().draft);
@@ -210,7 +229,7 @@ impl Frames {
         }
         let frames = &mut self.frames;
         self.workers.retain(|worker, heard| {
-            let silent = *heard + WORKER_TIME <= now;
+            let silent = heard.at + WORKER_TIME <= now;
             if silent {
                 // Its leases are lost already: they end sooner than this.
                 frames.values_mut().for_each(|frame| frame.forget(worker));
@@ -262,7 +281,7 @@ impl Frames {
             return Err(Refusal::Full { what: "workers", most });
         }
         let name = self.workers.get_key_value(worker).map_or_else(|| Arc::from(worker), |(name, _)| name.clone());
-        self.workers.insert(name.clone(), now);
+        self.workers.entry(name.clone()).or_insert(Heard { at: now, threads: 1 }).at = now;
         Ok(name)
     }
 }

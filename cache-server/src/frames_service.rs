@@ -179,7 +179,7 @@ impl Board {
     }
 
     /// Waits for work; `None` when none came up in time.
-    async fn lease(&self, tenant: &Tenant, worker: &str) -> Result<Option<v1::Lease>, Refusal> {
+    async fn lease(&self, tenant: &Tenant, worker: &str, threads: u32) -> Result<Option<v1::Lease>, Refusal> {
         let mut work = self.work.listen();
         let wait = tokio::time::sleep(LEASE_WAIT);
         tokio::pin!(wait);
@@ -187,7 +187,7 @@ impl Board {
             if self.work.is_closed() {
                 return Err(Refusal::Closing);
             }
-            if let Some(lease) = self.change(|frames, now| frames.lease(tenant, worker, now))? {
+            if let Some(lease) = self.change(|frames, now| frames.lease(tenant, worker, threads, now))? {
                 return Ok(Some(lease));
             }
             tokio::select! {
@@ -234,7 +234,8 @@ impl FramesTrait for FramesService {
 
     async fn lease(&self, request: Request<v1::LeaseRequest>) -> Result<Response<v1::LeaseResponse>, Status> {
         let tenant = tenant(&request);
-        let lease = self.0.lease(&tenant, &named(&tenant, &request.get_ref().worker)?).await?;
+        let v1::LeaseRequest { worker, threads } = request.into_inner();
+        let lease = self.0.lease(&tenant, &named(&tenant, &worker)?, threads).await?;
         Ok(Response::new(v1::LeaseResponse { lease }))
     }
 

@@ -3,6 +3,7 @@
 
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 
 use cache_core::rounds::{Plan, Step};
 use cache_proto::convert;
@@ -148,7 +149,9 @@ impl Farm {
     }
 
     fn lease(&mut self, worker: &str) -> bool {
-        let Some(lease) = self.frames.lease(&Tenant::default(), worker, self.now).expect("room") else { return false };
+        let Some(lease) = self.frames.lease(&Tenant::default(), worker, 1, self.now).expect("room") else {
+            return false;
+        };
         self.log.set(self.log.get() + 1);
         let step = lease.step.clone().expect("a step");
         assert!(lease.tile_from < lease.tile_to && lease.tile_to <= TILES);
@@ -236,7 +239,7 @@ proptest! {
 }
 
 fn lease(frames: &mut Frames, worker: &str, seconds: u64) -> Option<v1::Lease> {
-    frames.lease(&Tenant::default(), worker, Duration::from_secs(seconds)).expect("room")
+    frames.lease(&Tenant::default(), worker, 1, Duration::from_secs(seconds)).expect("room")
 }
 
 fn opened(frames: &mut Frames, spec: v1::FrameSpec) -> Result<u64, Refusal> {
@@ -277,25 +280,76 @@ fn leases_shrink_as_work_runs_out_and_lost_tiles_are_given_first() {
     let mut frames = Frames::new(Limits::default(), 1);
     open(&mut frames, 64, 0);
     let range = |lease: Option<v1::Lease>| lease.map(|l| l.tile_from..l.tile_to);
-    assert_eq!(range(lease(&mut frames, "a", 0)), Some(0..16));
-    assert_eq!(range(lease(&mut frames, "b", 0)), Some(16..22));
+    assert_eq!(range(lease(&mut frames, "a", 0)), Some(0..32));
+    assert_eq!(range(lease(&mut frames, "b", 0)), Some(32..40));
     frames.leave("a");
     assert!(frames.take_changes().work);
-    assert_eq!(range(lease(&mut frames, "b", 0)), Some(0..14));
-    assert_eq!(range(lease(&mut frames, "b", 0)), Some(14..16));
+    assert_eq!(range(lease(&mut frames, "b", 0)), Some(0..28));
+    assert_eq!(range(lease(&mut frames, "b", 0)), Some(28..32));
+}
+
+/// Each thread wants its share.
+#[test]
+fn a_worker_of_many_threads_gets_smaller_leases() {
+    let mut frames = Frames::new(Limits::default(), 1);
+    open(&mut frames, 64, 0);
+    let mut tiles = |worker, threads| {
+        let lease = frames.lease(&Tenant::default(), worker, threads, Duration::ZERO).expect("room").expect("work");
+        lease.tile_to - lease.tile_from
+    };
+    assert_eq!([tiles("a", 8), tiles("a", 8)], [4, 3]);
+    assert_eq!([tiles("b", 0), tiles("c", u32::MAX)], [3, 1]);
+}
+
+/// Ranges of tiles leased to a worker of two threads, round by round, until there are pixels to make. Every round tests a pixel
+/// of each of the `tiles`; `took` says how many seconds the worker claims to have worked on one.
+fn shared(tiles: u32, took: impl Fn(u32) -> f64) -> Vec<Vec<Range<u32>>> {
+    let mut frames = Frames::new(Limits::default(), 1);
+    opened(&mut frames, v1::FrameSpec { width: 64, height: 64 * tiles, tile_size: 64, ..spec(1, 1) }).expect("room");
+    let (mut rounds, mut now) = (BTreeMap::<u32, Vec<_>>::new(), Duration::ZERO);
+    while let Some(work) = frames.lease(&Tenant::default(), "a", 2, now).expect("room") {
+        let step = work.step.as_ref().expect("a step");
+        if step.level == 0 {
+            break;
+        }
+        now += Duration::from_secs(10);
+        let range = work.tile_from..work.tile_to;
+        let request = v1::CompleteRequest {
+            worker: "a".into(),
+            lease: work.id,
+            frame: work.frame,
+            worked_seconds: range.clone().map(&took).sum(),
+            ..Default::default()
+        };
+        assert!(frames.complete(request, now, |_, _| Mark::default()).expect("sound"));
+        rounds.entry(step.index).or_default().push(range);
+    }
+    rounds.into_values().collect()
+}
+
+/// As a picture with sky above and one window below.
+#[test]
+fn a_round_is_shared_by_what_tiles_took_before() {
+    let rounds = shared(64, |tile| if tile == 60 { 0.9 } else { 1e-4 });
+    let last = rounds.last().expect("rounds");
+    let hardest = last.iter().find(|range| range.contains(&60)).expect("somebody does it");
+    assert!(hardest.len() <= 4 && last.len() <= 8, "{last:?}");
 }
 
 #[test]
-fn leases_of_quick_tiles_are_larger() {
-    for (milliseconds, next) in [(1, 48), (40, 12), (16_000, 12)] {
-        let mut frames = Frames::new(Limits::default(), 1);
-        open(&mut frames, 64, 0);
-        let first = lease(&mut frames, "a", 0).expect("work");
-        let now = Duration::from_millis(milliseconds);
-        assert!(complete_at(&mut frames, "a", &first, 4 * 4 * 3, now).expect("sound"));
-        let second = lease(&mut frames, "a", 16).expect("work");
-        assert_eq!((first.tile_to, second.tile_to - second.tile_from), (16, next), "{milliseconds} ms");
-    }
+fn leases_are_as_long_as_the_work_takes_however_long_it_waits() {
+    // Ten milliseconds of work, or half of an equal share where that is more.
+    let tenths = |took: f64| shared(40, |_| took).last().expect("rounds").iter().map(Range::len).collect::<Vec<_>>();
+    assert_eq!(tenths(1e-3), [10, 10, 10, 10]);
+    assert_eq!(tenths(1.9e-3), [10, 7, 5, 5, 5, 5, 3]);
+    assert_eq!(tenths(0.2), [10, 7, 5, 4, 3, 2, 2, 1, 1, 1, 1, 1, 1, 1]);
+}
+
+/// Nobody works longer than it has a lease: else all other work would seem nothing.
+#[test]
+fn a_worker_that_lies_takes_no_work_from_others() {
+    let rounds = shared(64, |tile| if tile == 63 { 1e9 } else { 1.0 });
+    assert!(rounds.last().expect("rounds").len() > 5, "{rounds:?}");
 }
 
 #[test]
@@ -304,16 +358,16 @@ fn a_lease_has_something_to_do() {
     // Tiles of 4 x 4 pixels in a row: the first round tests one pixel of the first tile, and then of every 16th.
     open(&mut frames, 64, 1);
     let range = |lease: Option<v1::Lease>| lease.map(|l| l.tile_from..l.tile_to);
-    assert_eq!(range(lease(&mut frames, "a", 0)), Some(0..16));
-    assert_eq!(range(lease(&mut frames, "b", 0)), Some(16..32));
+    assert_eq!(range(lease(&mut frames, "a", 0)), Some(0..32));
+    assert_eq!(range(lease(&mut frames, "b", 0)), Some(32..48));
     frames.leave("a");
     assert_eq!(range(lease(&mut frames, "b", 0)), Some(0..16));
-    assert_eq!(range(lease(&mut frames, "c", 0)), Some(32..48));
+    assert_eq!(range(lease(&mut frames, "c", 0)), Some(16..32));
     // The pattern fits no other tiles, and the rows below the picture are nobody's.
     let odd = v1::FrameSpec { width: 64 * 5, height: 5, tile_size: 5, ..spec(1, 1) };
     opened(&mut frames, odd).expect("room");
     assert_eq!(range(lease(&mut frames, "d", 0)), Some(48..64));
-    assert_eq!(range(lease(&mut frames, "d", 0)), Some(0..5));
+    assert_eq!(range(lease(&mut frames, "d", 0)), Some(0..10));
 }
 
 #[test]
@@ -460,7 +514,7 @@ fn lists_are_bounded() {
     for worker in 0..Limits::default().workers {
         lease(&mut frames, &worker.to_string(), 0);
     }
-    let mut asks = |worker| frames.lease(&Tenant::default(), worker, Duration::ZERO);
+    let mut asks = |worker| frames.lease(&Tenant::default(), worker, 1, Duration::ZERO);
     assert!(matches!(asks("one more"), Err(Refusal::Full { what: "workers", .. })));
     for _ in 1..Limits::default().leases {
         assert!(matches!(asks("0"), Ok(Some(_))));
@@ -473,7 +527,7 @@ fn a_tenants_workers_and_others_do_not_meet() {
     let mut frames = Frames::new(Limits::default(), 1);
     let frame = open(&mut frames, 4, 0);
     let other = Tenant::from("other");
-    assert_eq!(frames.lease(&other, "other/a", Duration::ZERO).expect("room"), None);
+    assert_eq!(frames.lease(&other, "other/a", 1, Duration::ZERO).expect("room"), None);
     assert!(matches!(frames.frame(&other, frame).map(Frame::job), Err(Refusal::NoFrame(_))));
     assert!(lease(&mut frames, "a", 0).is_some());
 }
@@ -535,37 +589,4 @@ fn a_lease_its_worker_never_heard_of_runs_out() {
     frames.renew("a", &BTreeSet::from([heard.id]), Duration::from_secs(5));
     frames.tick(Duration::from_secs(7));
     assert_eq!(frames.renew("a", &BTreeSet::from([heard.id, unheard.id]), Duration::from_secs(7)), [heard.id]);
-}
-
-/// Two workers that wait ten seconds for the processor with each lease, and say that they worked a millisecond a tile.
-#[test]
-fn leases_are_as_long_as_the_work_takes_however_long_it_waits() {
-    let sizes = |worked_a_tile: f64| {
-        let mut frames = Frames::new(Limits::default(), 1);
-        open(&mut frames, 400, 0);
-        let (mut sizes, mut now) = (vec![], 0);
-        lease(&mut frames, "idle", now);
-        while let Some(work) = lease(&mut frames, "a", now) {
-            now += 5;
-            sizes.push(work.tile_to - work.tile_from);
-            let tile = |tile| v1::FrameTile { tile, pixels: vec![0; 48].into() };
-            let request = v1::CompleteRequest {
-                worker: "a".into(),
-                lease: work.id,
-                frame: work.frame,
-                tiles: (work.tile_from..work.tile_to).map(tile).collect(),
-                worked_seconds: worked_a_tile * f64::from(work.tile_to - work.tile_from),
-                ..Default::default()
-            };
-            assert!(frames.complete(request, Duration::from_secs(now), |_, _| Mark::default()).expect("sound"));
-        }
-        sizes
-    };
-    // Ten milliseconds of work, unless that is more than half of what is left.
-    let short = sizes(1e-3);
-    assert!(short.iter().rev().skip_while(|size| **size < 10).all(|size| *size >= 10), "{short:?}");
-    assert!(short.contains(&10), "{short:?}");
-    // Work that takes long is cut small near the end; nobody worked longer than it had the lease.
-    assert_eq!(sizes(1e9).last(), Some(&1));
-    assert!(sizes(1e9).len() > short.len());
 }

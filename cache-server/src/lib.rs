@@ -11,6 +11,7 @@
 //! - [`archive`]: caches as files: united, exported, imported.
 //! - [`query`]: sealed levels kept ready to answer clients that hold no replica.
 //! - [`spec`]: what a frame asks for, checked once.
+//! - [`expected`]: how long tiles will take, by how long they took; no I/O.
 //! - [`round`]: the tiles of one step: pending, leased or done; no I/O.
 //! - [`frame`]: one frame: its plan, its current round, and what its owner has still to be told; no I/O.
 //! - [`frames`]: all frames and workers: who gets which lease, and when it is lost; no I/O, time is passed in.
@@ -40,6 +41,7 @@ pub mod query;
 pub mod replica;
 pub mod store;
 
+pub mod expected;
 pub mod frame;
 pub mod frames;
 pub mod round;

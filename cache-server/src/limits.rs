@@ -61,7 +61,7 @@ const BOUNDS: [Bound; 9] = [
     bound("subscribers", "subscriptions", 8192, ANY, |l| &mut l.subscribers),
     bound("frames", "frames open at once", 64, ANY, |l| &mut l.frames),
     bound("workers", "workers", 4096, ANY, |l| &mut l.workers),
-    bound("leases", "leases one worker holds at once", 64, 1..=1024, |l| &mut l.leases),
+    bound("leases", "leases one worker holds at once, two for each of its threads", 128, 1..=1024, |l| &mut l.leases),
 ];
 
 impl Default for Limits {

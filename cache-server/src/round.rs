@@ -8,7 +8,16 @@ use std::time::Duration;
 use cache_core::rounds::{PATTERN, rank};
 use cache_proto::v1;
 
+use crate::expected::Expected;
 use crate::spec::Job;
+
+/// A lease is this fraction of an equal share of what is pending: large at first, small near the end, so that all
+/// workers finish a step together (guided self-scheduling).
+const SHARES: f64 = 2.0;
+
+/// What a lease should take at least, as far as is known: a small part of that is spent on giving it out. Where a whole step is little work,
+/// some of many workers get none of it.
+const LEASE_LEAST: Duration = Duration::from_millis(10);
 
 /// A range of tiles a worker does.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -33,13 +42,18 @@ pub struct Round {
     /// Disjoint ranges, from -> to, lowest first.
     pending: BTreeMap<u32, u32>,
     pending_tiles: u32,
+    /// Sum of what is expected of them.
+    pending_work: f64,
     leases: BTreeMap<u64, Held>,
     leased_tiles: u32,
     tiles: u32,
     empty: Empty,
     gathered: u64,
-    /// Time worked in the leases that are done, all together; not what they waited, for the processor, say.
-    worked: Duration,
+    expected: Expected,
+    /// Of each tile, what is expected of it in this step, seconds, 0 where there is nothing to do; one each where nothing is
+    /// known.
+    work: Vec<f32>,
+    known: bool,
 }
 
 /// Which tiles have nothing to do: no pixel whose rank the step tests lies in them.
@@ -74,10 +88,13 @@ impl Empty {
 }
 
 impl Round {
-    /// A step with all tiles of the picture pending.
-    pub fn new(step: v1::Step, job: &Job) -> Self {
+    /// A step with all tiles of the picture pending; `expected` knows what they took in the steps before.
+    pub fn new(step: v1::Step, job: &Job, mut expected: Expected) -> Self {
         let (tiles, empty) = (job.tiles, Empty::new(&step, &job.spec));
+        let (mut work, known) = expected.of(step.level);
+        (0..tiles).filter(|tile| empty.has(*tile)).for_each(|tile| work[tile as usize] = 0.0);
         Self {
+            pending_work: sum(&work),
             step,
             pending: BTreeMap::from([(0, tiles)]),
             pending_tiles: tiles,
@@ -86,7 +103,9 @@ impl Round {
             tiles,
             empty,
             gathered: 0,
-            worked: Duration::ZERO,
+            expected,
+            work,
+            known,
         }
     }
 
@@ -130,34 +149,44 @@ impl Round {
         self.gathered
     }
 
-    /// How many tiles take one worker that long, as far as those done tell; 0 if they tell nothing.
-    pub fn tiles_in(&self, time: Duration) -> u32 {
-        let tiles = f64::from(self.done_tiles()) * time.as_secs_f64() / self.worked.as_secs_f64();
-        // Infinity and what is more than all saturate.
-        if self.worked.is_zero() { 0 } else { tiles as u32 }
+    /// What its tiles took, for the step after it.
+    pub fn into_expected(self) -> Expected {
+        self.expected
     }
 
-    /// Leases up to `most` of the lowest pending tiles, contiguous, and empty ones behind them; more if all those are
-    /// empty, since a lease costs more than looking at nothing. `None` when none is pending.
+    /// How much of what is expected one of `threads` should get now.
+    fn share(&self, threads: u32) -> f64 {
+        let least = if self.known { LEASE_LEAST.as_secs_f64() } else { 0.0 };
+        (self.pending_work / f64::from(threads) / SHARES).max(least)
+    }
+
+    /// Leases one of `threads` its share of the work in the lowest pending tiles, contiguous, at least one and at most `most`,
+    /// and the empty ones behind them: a lease costs more than looking at nothing. `None` when none is pending.
     pub fn grant(
         &mut self,
         lease: u64,
         worker: Arc<str>,
+        threads: u32,
         most: u32,
         since: Duration,
         deadline: Duration,
     ) -> Option<Range<u32>> {
+        let share = self.share(threads.max(1));
         let (from, to) = self.pending.pop_first()?;
-        let mut cut = from.saturating_add(most.max(1)).min(to);
-        let mut idle = (from..cut).all(|tile| self.empty.has(tile));
-        while cut < to && (idle || self.empty.has(cut)) {
-            idle &= self.empty.has(cut);
+        let (mut cut, mut work) = (from, 0.0);
+        while cut < to {
+            let next = f64::from(self.work[cut as usize]);
+            if work > 0.0 && next > 0.0 && (work + next > share || cut - from >= most) {
+                break;
+            }
+            work += next;
             cut += 1;
         }
         if cut < to {
             self.pending.insert(cut, to);
         }
         self.pending_tiles -= cut - from;
+        self.pending_work -= work;
         self.leased_tiles += cut - from;
         self.leases.insert(lease, Held { worker, tiles: from..cut, since, deadline });
         Some(from..cut)
@@ -192,7 +221,8 @@ impl Round {
             self.leased_tiles -= held.tiles.end - held.tiles.start;
             self.gathered += gathered;
             // Nobody works longer than it has the work.
-            self.worked += worked.min(now.saturating_sub(held.since));
+            let worked = worked.min(now.saturating_sub(held.since));
+            self.expected.took(held.tiles, |tile| self.empty.has(tile), worked);
         }
     }
 
@@ -200,16 +230,22 @@ impl Round {
     pub fn put_back(&mut self, lost: impl Fn(&Held) -> bool) -> u32 {
         let (pending, pending_tiles, leased_tiles) =
             (&mut self.pending, &mut self.pending_tiles, &mut self.leased_tiles);
+        let (pending_work, work) = (&mut self.pending_work, &self.work);
         let before = self.leases.len();
         self.leases.retain(|_, held| {
             if !lost(held) {
                 return true;
             }
             pending.insert(held.tiles.start, held.tiles.end);
+            *pending_work += sum(&work[held.tiles.start as usize..held.tiles.end as usize]);
             *pending_tiles += held.tiles.end - held.tiles.start;
             *leased_tiles -= held.tiles.end - held.tiles.start;
             false
         });
         (before - self.leases.len()) as u32
     }
+}
+
+fn sum(work: &[f32]) -> f64 {
+    work.iter().map(|seconds| f64::from(*seconds)).sum()
 }

@@ -336,7 +336,7 @@ fn open() -> v1::OpenRequest {
 }
 
 fn ask(worker: &str) -> v1::LeaseRequest {
-    v1::LeaseRequest { worker: worker.into() }
+    v1::LeaseRequest { worker: worker.into(), threads: 1 }
 }
 
 /// Does whatever it is given, for ever: one record for each tile in the first step, then none.

@@ -1,16 +1,17 @@
 //! The worker process: leases work from a server, does it, says what came of it.
 //!
-//! Each of its threads holds one lease at a time. What a lease yields depends on the frame, the step and the tiles alone,
+//! Each of its threads works on one lease at a time, while it tells of the one before. What a lease yields depends on the frame, the step and the tiles alone,
 //! so a lease that is lost on the way is simply done again by somebody.
 
 use std::collections::BTreeSet;
 use std::hash::{BuildHasher as _, Hasher as _};
+use std::pin::pin;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use cache_core::{Namespace, Record, Tag};
 use cache_proto::v1;
-use tokio::task::JoinSet;
+use tokio::task::{JoinError, JoinSet};
 use tokio::time::Instant;
 use tonic::{Code, Status};
 use tracing::{debug, info, warn};
@@ -19,8 +20,9 @@ use crate::client::{self, Address, Backoff, Cache, Frames, Line};
 use crate::credentials::{CredentialArgs, Credentials};
 use crate::follow;
 use crate::job::{Dropped, Job, Work};
-use crate::ready::{Fault, Shelf};
+use crate::ready::{Fault, Ready, Shelf};
 use crate::scenes::Scenes;
+use crate::task::Done;
 use crate::threads::lock;
 use crate::traffic::Traffic;
 
@@ -33,7 +35,7 @@ const FAREWELL: Duration = Duration::from_secs(2);
 /// Pause when the server had no work and said so at once.
 const IDLE: Duration = Duration::from_millis(100);
 
-/// Most threads, since the server lets a worker hold so many leases.
+/// Most threads: the server lets a worker hold two leases for each.
 const THREADS_MAX: i64 = 64;
 
 /// Pause when the server has no room for one more worker or lease.
@@ -139,6 +141,20 @@ async fn stopped() {
     }
 }
 
+/// A lease whose work is done and of which the server does not know yet.
+struct Finished<J> {
+    ready: Arc<Ready<J>>,
+    step: v1::Step,
+    done: Done,
+    /// CPU time it took to seal what the work read.
+    sealing_seconds: f64,
+}
+
+/// What a task that tells of a lease came to.
+fn ended_well(ended: Result<Result<(), Status>, JoinError>) -> Result<(), Status> {
+    ended.unwrap_or_else(|e| Err(Status::internal(format!("a task of the worker failed: {e}"))))
+}
+
 /// One worker process as the server knows it, and the kind of job it does.
 pub struct Worker<J> {
     name: String,
@@ -174,7 +190,7 @@ impl<J: Job> Worker<J> {
         tasks.spawn(async move { renewing.renew().await });
         for _ in 0..threads {
             let leasing = self.clone();
-            tasks.spawn(async move { leasing.lease().await });
+            tasks.spawn(async move { leasing.lease(threads).await });
         }
         match tasks.join_next().await {
             Some(Ok(lost)) => lost,
@@ -214,47 +230,71 @@ impl<J: Job> Worker<J> {
         }
     }
 
-    async fn lease(self: Arc<Self>) -> Status {
+    /// Works on one lease after another. While what came of one is on its way to the server, the next is worked on.
+    async fn lease(self: Arc<Self>, threads: usize) -> Status {
+        // At most one.
+        let mut ending = JoinSet::new();
         loop {
-            let asked = Instant::now();
-            let request = v1::LeaseRequest { worker: self.name.clone() };
-            let leased = client::retry(|| {
-                let (mut frames, request) = (self.frames.clone(), request.clone());
-                async move { frames.lease(request).await }
-            });
-            let lease = match leased.await {
-                Ok(response) => response.lease,
-                Err(status) if status.code() == Code::ResourceExhausted => {
-                    debug!("{status}");
-                    tokio::time::sleep(FULL).await;
-                    continue;
+            let mut asked = pin!(self.ask(threads));
+            let leased = loop {
+                tokio::select! {
+                    leased = &mut asked => break leased,
+                    Some(ended) = ending.join_next() => if let Err(lost) = ended_well(ended) { return lost },
                 }
-                Err(status) => return status,
             };
-            let Some(lease) = lease else {
-                if asked.elapsed() < IDLE {
-                    tokio::time::sleep(IDLE).await;
-                }
-                continue;
+            let lease = match leased {
+                Ok(Some(lease)) => lease,
+                Ok(None) => continue,
+                Err(lost) => return lost,
             };
             lock(&self.held).insert(lease.id);
-            let outcome = self.do_lease(&lease).await;
-            lock(&self.held).remove(&lease.id);
-            match outcome {
-                Ok(()) => {}
-                Err(Fault::Gone) => debug!(lease.id, "lease is gone"),
-                Err(Fault::Unfit(reason)) => {
-                    if let Err(status) = self.decline(lease.frame, reason, false).await {
-                        return status;
-                    }
-                }
-                Err(Fault::Hopeless(reason)) => {
-                    if let Err(status) = self.decline(lease.frame, reason, true).await {
-                        return status;
-                    }
-                }
-                Err(Fault::Server(status)) => return status,
+            let done = self.do_lease(&lease).await;
+            if let Some(Err(lost)) = ending.join_next().await.map(ended_well) {
+                return lost;
             }
+            ending.spawn(self.clone().end(lease, done));
+        }
+    }
+
+    /// Asks for a lease for one of so many threads; `None` when there was none to be had for a while.
+    async fn ask(&self, threads: usize) -> Result<Option<v1::Lease>, Status> {
+        let asked = Instant::now();
+        let request = v1::LeaseRequest { worker: self.name.clone(), threads: threads as u32 };
+        let leased = client::retry(|| {
+            let (mut frames, request) = (self.frames.clone(), request.clone());
+            async move { frames.lease(request).await }
+        });
+        let lease = match leased.await {
+            Ok(response) => response.lease,
+            Err(status) if status.code() == Code::ResourceExhausted => {
+                debug!("{status}");
+                tokio::time::sleep(FULL).await;
+                None
+            }
+            Err(status) => return Err(status),
+        };
+        if lease.is_none() && asked.elapsed() < IDLE {
+            tokio::time::sleep(IDLE).await;
+        }
+        Ok(lease)
+    }
+
+    /// Tells the server what came of a lease. Only a server that is lost is an error.
+    async fn end(self: Arc<Self>, lease: v1::Lease, done: Result<Finished<J>, Fault>) -> Result<(), Status> {
+        let told = match done {
+            Ok(done) => self.tell(&lease, done).await,
+            Err(fault) => Err(fault),
+        };
+        lock(&self.held).remove(&lease.id);
+        match told {
+            Ok(()) => Ok(()),
+            Err(Fault::Gone) => {
+                debug!(lease.id, "lease is gone");
+                Ok(())
+            }
+            Err(Fault::Unfit(reason)) => self.decline(lease.frame, reason, false).await,
+            Err(Fault::Hopeless(reason)) => self.decline(lease.frame, reason, true).await,
+            Err(Fault::Server(status)) => Err(status),
         }
     }
 
@@ -274,20 +314,25 @@ impl<J: Job> Worker<J> {
         }
     }
 
-    /// A lease from its records' arrival to its acknowledged end.
-    async fn do_lease(self: &Arc<Self>, lease: &v1::Lease) -> Result<(), Fault> {
+    /// Does the work of a lease, once its records are there.
+    async fn do_lease(self: &Arc<Self>, lease: &v1::Lease) -> Result<Finished<J>, Fault> {
         let step = lease.step.clone().ok_or_else(|| Fault::Unfit("the server sent a lease without a step".into()))?;
-        let (worker, id) = (self.clone(), lease.id);
-        let dropped: Dropped = Arc::new(move || !lock(&worker.held).contains(&id));
+        let dropped = self.dropped(lease.id);
         let ready = self.shelf.frame(lease.frame, || self.describe(lease.frame)).await?;
         let (levels, sealing_seconds) = ready.levels(&step, &dropped).await?;
         let (tiles, known) = (lease.tile_from..lease.tile_to, ready.known());
-        let work = Work { step: step.clone(), tiles, levels, known, dropped: dropped.clone() };
+        let work = Work { step: step.clone(), tiles, levels, known, dropped };
         let done = ready.job.clone().run(work).await.map_err(Fault::Unfit)?;
-        let mut done = done.ok_or(Fault::Gone)?;
+        let done = done.ok_or(Fault::Gone)?;
+        Ok(Finished { ready, step, done, sealing_seconds })
+    }
+
+    /// Sends what came of a lease, and ends it.
+    async fn tell(self: &Arc<Self>, lease: &v1::Lease, finished: Finished<J>) -> Result<(), Fault> {
+        let Finished { ready, step, mut done, sealing_seconds } = finished;
         let worked_seconds = done.cpu_seconds;
         done.cpu_seconds += sealing_seconds;
-        let bytes_records = self.insert(&ready.draft, &done.records, &dropped).await?;
+        let bytes_records = self.insert(&ready.draft, &done.records, &self.dropped(lease.id)).await?;
         let request = v1::CompleteRequest {
             worker: self.name.clone(),
             lease: lease.id,
@@ -306,6 +351,12 @@ impl<J: Job> Worker<J> {
             debug!(lease.id, "completed too late");
         }
         Ok(())
+    }
+
+    /// Whether the server has declared a lease lost.
+    fn dropped(self: &Arc<Self>, lease: u64) -> Dropped {
+        let worker = self.clone();
+        Arc::new(move || !lock(&worker.held).contains(&lease))
     }
 
     async fn describe(&self, frame: u64) -> Result<v1::DescribeResponse, Status> {
