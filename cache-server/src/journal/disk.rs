@@ -67,7 +67,7 @@ impl Disk {
     /// The database, opened again if an append failed.
     fn database(&mut self) -> io::Result<&Database> {
         if self.database.is_none() {
-            let database = open(&self.path, self.sync, Undo::default(), |_| ()).map_err(plain)?;
+            let database = open(&self.path, self.sync, Undo::default()).map_err(plain)?;
             let next = last(&database).map_err(plain)?;
             if next.sequence < self.next.sequence {
                 let (there, kept) = (next.sequence, self.next.sequence);
@@ -124,21 +124,15 @@ impl Journal for Disk {
     }
 }
 
-/// Opens or makes a file, checking every page redb knows of. `unclean` is asked when the last process to use it did
-/// not close it.
-pub(super) fn open(
-    path: &Path,
-    sync: Sync,
-    undo: Undo,
-    unclean: impl Fn(&mut redb::RepairSession) + 'static,
-) -> Result<Database, redb::Error> {
+/// Opens or makes a file, checking every page redb knows of.
+pub(super) fn open(path: &Path, sync: Sync, undo: Undo) -> Result<Database, redb::Error> {
     let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)?;
     let mut builder = Database::builder();
-    builder.set_cache_size(CACHE_BYTES).set_check_integrity_on_open(true).set_repair_callback(unclean);
+    builder.set_cache_size(CACHE_BYTES).set_check_integrity_on_open(true);
     Ok(builder.create_with_backend(Device::new(file, sync, undo))?)
 }
 
-/// Opens a file that must not be written to.
+/// Opens a file that must not be written to; [`redb::Error::RepairAborted`] says that its last process did not close it.
 pub(super) fn open_read_only(path: &Path) -> Result<redb::ReadOnlyDatabase, redb::Error> {
     let mut builder = Database::builder();
     builder.set_cache_size(CACHE_BYTES);
