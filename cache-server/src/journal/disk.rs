@@ -5,6 +5,7 @@
 
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io;
+use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 
 use cache_proto::v1::Entry;
@@ -130,6 +131,13 @@ pub(super) fn open(path: &Path, sync: Sync, undo: Undo) -> Result<Database, redb
     let mut builder = Database::builder();
     builder.set_cache_size(CACHE_BYTES).set_check_integrity_on_open(true);
     Ok(builder.create_with_backend(Device::new(file, sync, undo))?)
+}
+
+/// Whether the last process to use a file closed it: the flag `recovery_required` of redb's header says so (its
+/// docs/design.md). An open that checks calls for a repair always, one that does not trusts whatever sizes it finds.
+pub(super) fn is_closed(file: &File) -> bool {
+    let mut flags = [0];
+    file.read_exact_at(&mut flags, 9).is_ok() && flags[0] & 2 == 0
 }
 
 /// Opens a file that must not be written to; [`redb::Error::RepairAborted`] says that its last process did not close it.

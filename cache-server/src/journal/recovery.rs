@@ -151,9 +151,9 @@ fn check(path: &Path, sync: Sync) -> Result<Result<(Database, Place, Report), St
 /// were sound before they were appended.
 fn check_noting(path: &Path, sync: Sync, undo: &Undo) -> Result<Result<(Database, Place, Report), String>, OpenError> {
     let failed = |error: io::Error| OpenError::File { path: path.into(), error };
-    // Before redb writes to it. That its checking open calls for a repair says nothing of how the file was left.
-    let closed = matches!(contained(|| disk::open_read_only(path).map(drop)), Ok(Ok(())));
-    let found = Found::scan(&File::open(path).map_err(failed)?).map_err(failed)?;
+    let file = File::open(path).map_err(failed)?;
+    // Before redb writes to it.
+    let (closed, found) = (disk::is_closed(&file), Found::scan(&file).map_err(failed)?);
     let database = match contained(|| disk::open(path, sync, undo.clone())) {
         Ok(Ok(database)) => database,
         Ok(Err(redb::Error::Io(error))) if of_the_disk(&error) => return Err(failed(error)),
@@ -165,7 +165,6 @@ fn check_noting(path: &Path, sync: Sync, undo: &Undo) -> Result<Result<(Database
         Ok(Err(Wrong::Newer(found))) => return Err(OpenError::Newer { path: path.into(), found }),
         Ok(Err(Wrong::Damaged(reason))) | Err(reason) => return Ok(Err(reason)),
     };
-    let file = File::open(path).map_err(failed)?;
     let torn = Some(place.sequence).filter(|next| !closed && found.broken.contains(next));
     let beyond: Vec<_> = found.values.into_iter().filter(|(_, header)| header.sequence >= place.sequence).collect();
     match contained(|| copy(&file, &beyond, &database, place)) {
