@@ -246,6 +246,23 @@ fn only_a_crash_leaves_a_torn_append() {
     }
 }
 
+/// redb would make room for pages of 4 GiB.
+#[test]
+fn a_header_that_claims_more_than_the_file_is_not_believed() {
+    for closed in [false, true] {
+        for highest in [64 + 15, 64 + 47, 192 + 15, 192 + 47] {
+            let mut bytes = file(closed).to_vec();
+            bytes[highest] = 20 << 3;
+            let directory = tempfile::tempdir().expect("a directory");
+            fs::write(directory.path().join(FILE), bytes).expect("written");
+            let (mut disk, report) = open(directory.path());
+            assert_eq!(held(&mut disk), appends().concat());
+            let reason = report.damage.expect("told").reason;
+            assert!(reason.contains("names pages larger than the file"), "{reason}");
+        }
+    }
+}
+
 /// The power is cut at any moment of an append, and what the kernel had not yet brought to the device is lost, any part of
 /// it: what was acknowledged before is there, and nothing that was not appended.
 #[test]
