@@ -174,24 +174,35 @@ impl Replica {
     /// The records of a draft belong to a namespace from now on, and so do those that come later.
     fn publish(&mut self, draft: Namespace, namespace: Namespace) -> Result<Added, Refusal> {
         let log = self.kept.get(&draft).map_or(Vec::new(), |kept| kept.set.since(0).to_vec());
-        self.admit(&namespace, units(&log))?;
-        let set = &mut self.kept.entry(namespace).or_default().set;
-        let (start, known, before) = (set.position(), set.len(), set.units());
-        for (tag, record) in log {
-            set.insert(tag, record);
-        }
-        let (end, added) = (set.position(), (set.len() - known) as u64);
-        self.held += set.units() - before;
+        let start = self.mark(&namespace).position;
+        // Nothing comes of a draft without records: limits do not count a namespace nothing is known of.
+        let added = if log.is_empty() {
+            Added { added: 0, position: start }
+        } else {
+            self.admit(&namespace, units(&log))?;
+            self.copy(namespace, log)
+        };
         // Said again, it brings nothing new: the first time tells which part of the log the draft is.
         if let Entry::Vacant(first) = self.published.entry(draft) {
-            first.insert(Published { namespace, range: start..end });
+            first.insert(Published { namespace, range: start as usize..added.position as usize });
             self.publications.push_back(draft);
             if self.publications.len() > PUBLISHED_MAX {
                 self.publications.pop_front().map(|oldest| self.published.remove(&oldest));
             }
         }
         self.retire(&draft);
-        Ok(Added { added, position: end as u64 })
+        Ok(added)
+    }
+
+    /// Unites with a part of a log there is room for.
+    fn copy(&mut self, into: Namespace, log: Vec<(Tag, Record)>) -> Added {
+        let set = &mut self.kept.entry(into).or_default().set;
+        let (before, known) = (set.units(), set.len());
+        for (tag, record) in log {
+            set.insert(tag, record);
+        }
+        self.held += set.units() - before;
+        Added { added: (set.len() - known) as u64, position: set.position() as u64 }
     }
 
     /// A frame begins to fill a draft. One that was published comes back as it was, if there is room.
@@ -202,13 +213,8 @@ impl Replica {
             log.get(published.range.clone()).map(<[_]>::to_vec)
         });
         let again = again.filter(|log| self.admit(&draft, units(log)).is_ok());
-        let kept = self.kept.entry(draft).or_default();
-        kept.holds += 1;
-        let before = kept.set.units();
-        for (tag, record) in again.unwrap_or_default() {
-            kept.set.insert(tag, record);
-        }
-        self.held += kept.set.units() - before;
+        self.kept.entry(draft).or_default().holds += 1;
+        self.copy(draft, again.unwrap_or_default());
     }
 
     /// A frame has ended: a draft no other frame fills is forgotten if it was published, or nothing is known of it.
@@ -631,5 +637,21 @@ mod tests {
             replica.release(&Namespace([view; 32]));
         }
         assert_eq!(replica.census(), (0, 0));
+    }
+
+    /// Each such frame left a namespace that no limit counted.
+    #[test]
+    fn published_drafts_without_records_leave_nothing() {
+        let mut replica = Replica::new(Limits { namespaces: 1, ..Limits::default() });
+        for view in 0..9 {
+            let (draft, namespace) = (Namespace([view; 32]), Namespace([100 + view; 32]));
+            replica.hold(draft);
+            replica.apply(Checked::Publication { draft, namespace }).expect("nothing to find room for");
+            replica.release(&draft);
+        }
+        assert_eq!(replica.census(), (0, 0));
+        // What comes late still finds its namespace.
+        replica.insert(Namespace([3; 32]), Tag::level(1), &[record(1, 0.0)]).expect("room");
+        assert_eq!(replica.mark(&Namespace([103; 32])).position, 1);
     }
 }

@@ -5,6 +5,7 @@
 
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io;
+use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 
 use cache_proto::v1::Entry;
@@ -67,7 +68,7 @@ impl Disk {
     /// The database, opened again if an append failed.
     fn database(&mut self) -> io::Result<&Database> {
         if self.database.is_none() {
-            let database = open(&self.path, self.sync, Undo::default(), |_| ()).map_err(plain)?;
+            let database = open(&self.path, self.sync, Undo::default()).map_err(plain)?;
             let next = last(&database).map_err(plain)?;
             if next.sequence < self.next.sequence {
                 let (there, kept) = (next.sequence, self.next.sequence);
@@ -124,25 +125,48 @@ impl Journal for Disk {
     }
 }
 
-/// Opens or makes a file, checking every page redb knows of. `unclean` is asked when the last process to use it did
-/// not close it.
-pub(super) fn open(
-    path: &Path,
-    sync: Sync,
-    undo: Undo,
-    unclean: impl Fn(&mut redb::RepairSession) + 'static,
-) -> Result<Database, redb::Error> {
+/// Opens or makes a file, checking every page redb knows of.
+pub(super) fn open(path: &Path, sync: Sync, undo: Undo) -> Result<Database, redb::Error> {
     let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)?;
+    check_roots(&file)?;
     let mut builder = Database::builder();
-    builder.set_cache_size(CACHE_BYTES).set_check_integrity_on_open(true).set_repair_callback(unclean);
+    builder.set_cache_size(CACHE_BYTES).set_check_integrity_on_open(true);
     Ok(builder.create_with_backend(Device::new(file, sync, undo))?)
 }
 
-/// Opens a file that must not be written to.
+/// Whether the last process to use a file closed it: the flag `recovery_required` of redb's header says so (its
+/// docs/design.md). An open that checks calls for a repair always, one that does not trusts whatever sizes it finds.
+pub(super) fn is_closed(file: &File) -> bool {
+    let mut flags = [0];
+    file.read_exact_at(&mut flags, 9).is_ok() && flags[0] & 2 == 0
+}
+
+/// Refuses a file whose header names roots larger than itself: redb makes room for a page before it reads it, 8 TiB for
+/// what a damaged header may say, and memory that is not there ends the process. Two slots of two roots each, and a page's
+/// size as a power of two in the five highest bits of its number: redb's docs/design.md.
+fn check_roots(file: &File) -> Result<(), redb::Error> {
+    let (mut header, length) = ([0; 320], file.metadata()?.len());
+    if length < header.len() as u64 {
+        return Ok(());
+    }
+    file.read_exact_at(&mut header, 0)?;
+    for slot in [&header[64..192], &header[192..]] {
+        for highest in [slot[15], slot[47]] {
+            if 4096 << (highest >> 3) > length {
+                return Err(redb::Error::Corrupted("its header names pages larger than the file".into()));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Opens a file that must not be written to; [`redb::Error::RepairAborted`] says that its last process did not close it.
 pub(super) fn open_read_only(path: &Path) -> Result<redb::ReadOnlyDatabase, redb::Error> {
+    let file = File::open(path)?;
+    check_roots(&file)?;
     let mut builder = Database::builder();
     builder.set_cache_size(CACHE_BYTES);
-    Ok(builder.open_read_only_with_backend(Device::new(File::open(path)?, Sync::PageCache, Undo::default()))?)
+    Ok(builder.open_read_only_with_backend(Device::new(file, Sync::PageCache, Undo::default()))?)
 }
 
 /// Makes a new file a journal.

@@ -7,7 +7,6 @@ use std::fs::{self, File};
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
-use std::{cell::Cell, rc::Rc};
 
 use redb::Database;
 
@@ -117,7 +116,7 @@ pub(super) fn open(path: &Path, sync: Sync) -> Result<(Database, Place, Report),
         Err(error) => return Err(failed(error)),
     };
     if !known {
-        let database = disk::open(path, sync, Undo::default(), |_| ()).map_err(|e| failed(disk::plain(e)))?;
+        let database = disk::open(path, sync, Undo::default()).map_err(|e| failed(disk::plain(e)))?;
         disk::begin(&database).map_err(|e| failed(disk::plain(e)))?;
         sync_directory(path).map_err(failed)?;
         return Ok((database, Place::default(), Report::default()));
@@ -148,26 +147,14 @@ fn check(path: &Path, sync: Sync) -> Result<Result<(Database, Place, Report), St
 
 /// The same, with what was changed noted.
 ///
-/// After a crash redb may go back to the append before the last. The values beyond, which lie there all the same, are
-/// added again: they were sound before they were appended.
+/// redb may go back to the append before the last. The values beyond, which lie there all the same, are added again: they
+/// were sound before they were appended.
 fn check_noting(path: &Path, sync: Sync, undo: &Undo) -> Result<Result<(Database, Place, Report), String>, OpenError> {
     let failed = |error: io::Error| OpenError::File { path: path.into(), error };
-    let crashed = Rc::new(Cell::new(false));
-    let told = crashed.clone();
-    let opened = contained(|| {
-        disk::open(path, sync, undo.clone(), move |repair| {
-            told.set(true);
-            repair.abort();
-        })
-    });
-    let (opened, beyond) = match opened {
-        Ok(Err(_)) if crashed.get() => {
-            let beyond = Found::scan(&File::open(path).map_err(failed)?).map_err(failed)?;
-            (contained(|| disk::open(path, sync, undo.clone(), |_| ())), beyond)
-        }
-        opened => (opened, Found::default()),
-    };
-    let database = match opened {
+    let file = File::open(path).map_err(failed)?;
+    // Before redb writes to it.
+    let (closed, found) = (disk::is_closed(&file), Found::scan(&file).map_err(failed)?);
+    let database = match contained(|| disk::open(path, sync, undo.clone())) {
         Ok(Ok(database)) => database,
         Ok(Err(redb::Error::Io(error))) if of_the_disk(&error) => return Err(failed(error)),
         Ok(Err(error)) => return Ok(Err(error.to_string())),
@@ -178,9 +165,8 @@ fn check_noting(path: &Path, sync: Sync, undo: &Undo) -> Result<Result<(Database
         Ok(Err(Wrong::Newer(found))) => return Err(OpenError::Newer { path: path.into(), found }),
         Ok(Err(Wrong::Damaged(reason))) | Err(reason) => return Ok(Err(reason)),
     };
-    let file = File::open(path).map_err(failed)?;
-    let torn = Some(place.sequence).filter(|next| beyond.broken.contains(next));
-    let beyond: Vec<_> = beyond.values.into_iter().filter(|(_, header)| header.sequence >= place.sequence).collect();
+    let torn = Some(place.sequence).filter(|next| !closed && found.broken.contains(next));
+    let beyond: Vec<_> = found.values.into_iter().filter(|(_, header)| header.sequence >= place.sequence).collect();
     match contained(|| copy(&file, &beyond, &database, place)) {
         Ok(Ok(place)) => {
             let torn = torn.filter(|torn| *torn >= place.sequence);
@@ -209,12 +195,12 @@ fn repair(path: &Path, reason: String) -> Result<Damage, OpenError> {
     let new = beside(path, "new");
     let build = || -> io::Result<()> {
         {
-            let database = disk::open(&new, Sync::Device, Undo::default(), |_| ()).map_err(disk::plain)?;
+            let database = disk::open(&new, Sync::Device, Undo::default()).map_err(disk::plain)?;
             disk::begin(&database).map_err(disk::plain)?;
             copy(&file, &found.values, &database, Place::default())?;
         }
         // Nothing is believed that was not read back.
-        let database = disk::open(&new, Sync::Device, Undo::default(), |_| ()).map_err(disk::plain)?;
+        let database = disk::open(&new, Sync::Device, Undo::default()).map_err(disk::plain)?;
         let mut rest = found.values.iter();
         let same = disk::read(&database, |_, read| {
             let written = rest.next().map(|(at, header)| salvage::payload(&file, *at, header));

@@ -229,6 +229,40 @@ fn after_a_crash_every_append_is_there() {
     }
 }
 
+/// The same bytes tell of a crash in one file and of nothing in the other: an append that failed may have left them.
+#[test]
+fn only_a_crash_leaves_a_torn_append() {
+    let next = appends().len() as u64;
+    let mut begun = Place { sequence: next, before: 0 }.seal(&[entry(1000, 1)]);
+    *begun.last_mut().expect("a byte") ^= 1;
+    for (closed, torn) in [(false, Some(next)), (true, None)] {
+        let mut bytes = file(closed).to_vec();
+        let free = memmem::find(&bytes, &[0; 4096]).expect("a page nobody uses");
+        bytes[free..free + begun.len()].copy_from_slice(&begun);
+        let directory = tempfile::tempdir().expect("a directory");
+        fs::write(directory.path().join(FILE), bytes).expect("written");
+        let report = open(directory.path()).1;
+        assert_eq!((report.appends, report.torn, report.damage), (next, torn, None));
+    }
+}
+
+/// redb would make room for pages of 4 GiB.
+#[test]
+fn a_header_that_claims_more_than_the_file_is_not_believed() {
+    for closed in [false, true] {
+        for highest in [64 + 15, 64 + 47, 192 + 15, 192 + 47] {
+            let mut bytes = file(closed).to_vec();
+            bytes[highest] = 20 << 3;
+            let directory = tempfile::tempdir().expect("a directory");
+            fs::write(directory.path().join(FILE), bytes).expect("written");
+            let (mut disk, report) = open(directory.path());
+            assert_eq!(held(&mut disk), appends().concat());
+            let reason = report.damage.expect("told").reason;
+            assert!(reason.contains("names pages larger than the file"), "{reason}");
+        }
+    }
+}
+
 /// The power is cut at any moment of an append, and what the kernel had not yet brought to the device is lost, any part of
 /// it: what was acknowledged before is there, and nothing that was not appended.
 #[test]
@@ -305,7 +339,7 @@ fn newer_journals_are_refused_and_left_alone() {
     let directory = tempfile::tempdir().expect("a directory");
     drop(open(directory.path()));
     let path = directory.path().join(FILE);
-    let database = disk::open(&path, Sync::PageCache, Undo::default(), |_| ()).expect("open");
+    let database = disk::open(&path, Sync::PageCache, Undo::default()).expect("open");
     disk::tests::claim_format(&database, value::FORMAT + 1);
     drop(database);
     let error = Disk::open(directory.path(), Sync::PageCache).err().expect("refused");

@@ -39,13 +39,19 @@ impl Camera {
         let forward = direction.try_normalize().ok_or("view direction must not be zero")?;
         let side = forward.cross(up).try_normalize().ok_or("view up must not be zero or parallel to the direction")?;
         let top = side.cross(forward);
+        // 32 bits hold the squares, and the ratios to one another in pictures of any shape.
         let extent = |size: f32, what: &str| -> Result<f32, String> {
-            if parallel {
-                (size > 0.0 && size.is_finite()).then_some(size / 2.0)
-            } else {
-                (size > 0.0 && size < std::f32::consts::PI).then(|| libm::tanf(size / 2.0))
+            let most = if parallel { 1e12 } else { std::f32::consts::PI };
+            if size > 1e-12 && size < most {
+                return Ok(if parallel { size / 2.0 } else { libm::tanf(size / 2.0) });
             }
-            .ok_or_else(|| format!("{what} view size {size} is out of range"))
+            Err(match parallel {
+                true => format!("{what} view size {size} is out of range; expected a length between 1e-12 and 1e12"),
+                false => format!(
+                    "{what} view size {} is out of range; expected degrees between 1e-10 and 180",
+                    size.to_degrees()
+                ),
+            })
         };
         Ok(Self {
             name: String::new(),

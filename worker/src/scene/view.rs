@@ -153,6 +153,17 @@ mod tests {
     }
 
     #[test]
+    fn the_smallest_and_largest_views_take_any_aspect() {
+        for (horizontal, vertical) in [("2e-12", "9e11"), ("9e11", "2e-12")] {
+            let camera = view(&format!("rvu -vtl -vh {horizontal} -vv {vertical}\n")).unwrap();
+            for aspect in [1.0 / 65536.0, 1.0, 65536.0] {
+                let there = camera.clone().with_aspect(aspect).aspect();
+                assert!((there / aspect - 1.0).abs() < 1e-5, "{there} for {aspect}");
+            }
+        }
+    }
+
+    #[test]
     fn what_is_no_view_is_an_error_with_its_line() {
         for (text, wanted) in [
             ("", "FILE: no view in it"),
@@ -165,12 +176,23 @@ mod tests {
             ("rvu -vp 1 2 nan\n", "FILE:1: -vp has `nan`"),
             ("rvu -vp 1 2 \u{17}3\n", "FILE:1: -vp has `\u{fffd}3`"),
             ("rvu -v\u{1b}[2J\n", "FILE:1: view option -v\u{fffd}[2J is not supported"),
-            ("rvu -vh 180\n", "FILE:1: horizontal view size"),
+            (
+                "rvu -vh 180\n",
+                "FILE:1: horizontal view size 180 is out of range; expected degrees between 1e-10 and 180",
+            ),
+            ("rvu -vh 1e-14\n", "FILE:1: horizontal view size 0.00000000000001 is out of range"),
             ("rvu -vd 0 0 1 -vu 0 0 1\n", "FILE:1: view up must not be"),
             ("rvu -vp 1e300 0 0\n", "FILE:1: view point"),
         ] {
             let message = view(text).unwrap_err();
             assert!(message.starts_with(wanted), "{text:?} gives {message:?}");
+        }
+        for size in ["-1", "0", "1e-30", "1e-45", "1e18", "6888888888888888888888888888888888880", "1e300"] {
+            for (option, what) in [("-vh", "horizontal"), ("-vv", "vertical")] {
+                let message = view(&format!("VIEW= -vtl\nrvu {option} {size}\n")).expect_err(size);
+                assert!(message.starts_with(&format!("FILE:2: {what} view size ")), "{message}");
+                assert!(message.ends_with(" is out of range; expected a length between 1e-12 and 1e12"), "{message}");
+            }
         }
         assert!(load(Path::new("/nowhere/a.vf")).unwrap_err().to_string().contains("cannot be read"));
     }
