@@ -137,9 +137,13 @@ impl Replica {
         let units = records.iter().map(Record::units).sum::<usize>();
         let published = self.published.get(&namespace).map(|published| published.namespace);
         if let Some(into) = published {
+            let held = self.kept.contains_key(&namespace);
             self.admit(&into, 2 * units)?;
+            if held {
+                self.admit(&namespace, 2 * units)?;
+            }
             self.unite(into, tag, records);
-            if !self.kept.contains_key(&namespace) {
+            if !held {
                 return Ok(Added::default());
             }
         }
@@ -637,6 +641,17 @@ mod tests {
             replica.release(&Namespace([view; 32]));
         }
         assert_eq!(replica.census(), (0, 0));
+    }
+
+    #[test]
+    fn what_is_refused_for_a_draft_is_not_in_its_namespace_either() {
+        let mut replica = Replica::new(Limits { namespaces: 1, ..Limits::default() });
+        let (draft, namespace) = (Namespace([1; 32]), Namespace([2; 32]));
+        replica.insert(namespace, Tag::level(1), &[record(1, 0.0)]).expect("room");
+        replica.hold(draft);
+        replica.apply(Checked::Publication { draft, namespace }).expect("nothing to find room for");
+        replica.insert(draft, Tag::level(1), &[record(2, 0.0)]).expect_err("a second namespace");
+        assert_eq!(replica.mark(&namespace).position, 1);
     }
 
     /// Each such frame left a namespace that no limit counted.
