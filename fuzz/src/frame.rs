@@ -95,7 +95,7 @@ impl Board {
                     self.complete(request);
                 }
             }
-            2 => self.lease(&worker),
+            2 => self.lease(&worker, u32::from(byte(bytes, 1)).pow(4)),
             // A lease completed with what it should bring, and sometimes more or less.
             3 => self.finish(bytes),
             4 => drop(self.frames.renew(&worker, &self.leases.iter().map(|(_, lease)| lease.id).collect(), self.now)),
@@ -129,8 +129,8 @@ impl Board {
         self.open.extend(self.frames.open(job, origin, |_, _| Mark::default()));
     }
 
-    fn lease(&mut self, worker: &str) {
-        if let Ok(Some(lease)) = self.frames.lease(&Tenant::default(), worker, self.now) {
+    fn lease(&mut self, worker: &str, threads: u32) {
+        if let Ok(Some(lease)) = self.frames.lease(&Tenant::default(), worker, threads, self.now) {
             assert!(lease.tile_from < lease.tile_to);
             self.leases.push((worker.into(), lease));
         }
