@@ -64,7 +64,8 @@ pub struct Host {
     child: Child,
     ask: ChildStdin,
     answers: BufReader<ChildStdout>,
-    folder: TempDir,
+    /// `None` only once another server has it.
+    folder: Option<TempDir>,
 }
 
 impl Host {
@@ -75,6 +76,14 @@ impl Host {
     pub fn start(kind: Kind, prepared: u64, size: u64) -> Result<Self, Box<dyn Error>> {
         // Not in memory, whatever the system's own choice is: journals are measured.
         let folder = tempfile::Builder::new().prefix("ambience-bench-").tempdir_in("/var/tmp")?;
+        Self::start_in(folder, kind, prepared, size)
+    }
+
+    /// The same in the folder of one that was killed.
+    ///
+    /// # Errors
+    /// When it does not come up.
+    pub fn start_in(folder: TempDir, kind: Kind, prepared: u64, size: u64) -> Result<Self, Box<dyn Error>> {
         let name = clap::ValueEnum::to_possible_value(&kind).ok_or("no such kind")?;
         let mut child = Command::new(std::env::current_exe()?)
             .args(["host", name.get_name()])
@@ -84,19 +93,35 @@ impl Host {
             .stdout(Stdio::piped())
             .spawn()?;
         let (ask, answers) = (child.stdin.take().ok_or("no stdin")?, child.stdout.take().ok_or("no stdout")?);
-        let mut host = Self { child, ask, answers: BufReader::new(answers), folder };
+        let mut host = Self { child, ask, answers: BufReader::new(answers), folder: Some(folder) };
         host.usage()?;
         Ok(host)
     }
 
+    /// Ends the server as `kill -9` does; its folder, for another.
+    ///
+    /// # Errors
+    /// The system's.
+    pub fn kill(mut self) -> Result<TempDir, Box<dyn Error>> {
+        self.child.kill()?;
+        self.child.wait()?;
+        let folder = self.folder.take().ok_or("no folder")?;
+        std::fs::remove_file(socket(folder.path()))?;
+        Ok(folder)
+    }
+
+    fn folder(&self) -> &Path {
+        self.folder.as_ref().map_or(Path::new(""), TempDir::path)
+    }
+
     /// Where it listens.
     pub fn address(&self) -> String {
-        format!("unix:{}", socket(self.folder.path()).display())
+        format!("unix:{}", socket(self.folder()).display())
     }
 
     /// A new connection.
     pub fn connect(&self) -> Line {
-        let path = socket(self.folder.path());
+        let path = socket(self.folder());
         connect_with(move || UnixStream::connect(path.clone()))
     }
 
@@ -119,6 +144,11 @@ impl Drop for Host {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// Where its journal lies.
+pub fn journal_in(folder: &Path) -> PathBuf {
+    folder.join("journal")
 }
 
 fn socket(folder: &Path) -> PathBuf {
@@ -201,8 +231,7 @@ pub fn serve(args: &HostArgs) -> Result<(), Box<dyn Error>> {
 }
 
 fn journal(args: &HostArgs) -> Result<Option<Box<dyn Journal>>, Box<dyn Error>> {
-    let disk =
-        |sync| Disk::open(&args.folder.join("journal"), sync).map(|(disk, _)| Box::new(disk) as Box<dyn Journal>);
+    let disk = |sync| Disk::open(&journal_in(&args.folder), sync).map(|(disk, _)| Box::new(disk) as Box<dyn Journal>);
     Ok(match args.kind {
         Kind::Bare | Kind::Keep | Kind::Write => None,
         Kind::Memory => Some(Box::new(cache_server::journal::Nowhere)),

@@ -9,12 +9,14 @@ use std::time::{Duration, Instant};
 
 use cache_core::{Namespace, Sealed};
 use cache_proto::v1;
+use cache_server::journal::device::Sync;
+use cache_server::journal::disk::Disk;
 use tokio::time::MissedTickBehavior;
 use tonic::Streaming;
 use worker::client::{self, Cache};
 
 use crate::bare::LIVE;
-use crate::host::{Host, Kind};
+use crate::host::{Host, Kind, journal_in};
 use crate::records::{self, A, NAMESPACE};
 use crate::report::{Report, bars, quantile};
 
@@ -49,6 +51,7 @@ enum Part {
     Out,
     Queries,
     Latency,
+    Start,
 }
 
 /// Arguments of the benchmark.
@@ -85,6 +88,9 @@ pub fn run(args: &ServiceArgs) -> Result<(), Box<dyn Error>> {
         }
         for load in [false, true].into_iter().filter(|_| named(Part::Latency)) {
             latency(&mut report, load).await?;
+        }
+        if named(Part::Start) {
+            starts(&mut report, args.rounds).await?;
         }
         Ok::<_, Box<dyn Error>>(())
     })?;
@@ -148,6 +154,38 @@ async fn insert(
         if !matches!(kind, Kind::Bare | Kind::Keep | Kind::Write) {
             chart.push((format!("in, batches of {size}, {name}"), rate / bare));
         }
+    }
+    Ok(())
+}
+
+/// From the start of a server whose journal holds records until it answers.
+async fn starts(report: &mut Report, rounds: usize) -> Result<(), Box<dyn Error>> {
+    report.line(&format!("\nstart: a journal of {RECORDS} records in batches of 4096, until the first answer"));
+    report.line(&format!("{:28} {:>10} {:>14}", "", "s", "s CPU"));
+    let mut host = Host::start(Kind::Page, 0, 1)?;
+    send(&mut client::cache(host.connect()), records::batches(&NAMESPACE, RECORDS, 4096)).await?;
+    for (closed, name) in [(false, "after kill -9"), (true, "after it was closed")] {
+        let (mut wall, mut cpu) = (Vec::new(), Vec::new());
+        for _ in 0..rounds {
+            let folder = host.kill()?;
+            if closed {
+                drop(Disk::open(&journal_in(folder.path()), Sync::PageCache).map_err(|e| e.to_string())?);
+            }
+            let start = Instant::now();
+            host = Host::start_in(folder, Kind::Page, 0, 1)?;
+            let known = loop {
+                match client::cache(host.connect()).info(v1::InfoRequest {}).await {
+                    Ok(info) => break info.into_inner().namespaces.iter().map(|n| n.records).sum::<u64>(),
+                    Err(_) => tokio::time::sleep(Duration::from_millis(10)).await,
+                }
+            };
+            wall.push(start.elapsed().as_secs_f64());
+            cpu.push(host.usage()?.cpu);
+            if known != RECORDS {
+                return Err(format!("{known} records came back of {RECORDS}").into());
+            }
+        }
+        report.line(&format!("{name:28} {:10.2} {:14.2}", quantile(&mut wall, 0.5), quantile(&mut cpu, 0.5)));
     }
     Ok(())
 }
