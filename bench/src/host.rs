@@ -5,6 +5,7 @@ use std::fs::File;
 use std::io::{BufRead as _, BufReader, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::sync::Arc;
 
 use cache_proto::v1::cache_server::CacheServer;
 use cache_server::journal::Journal;
@@ -64,8 +65,8 @@ pub struct Host {
     child: Child,
     ask: ChildStdin,
     answers: BufReader<ChildStdout>,
-    /// `None` only once another server has it.
-    folder: Option<TempDir>,
+    /// Goes with the last server that was started in it.
+    folder: Arc<TempDir>,
 }
 
 impl Host {
@@ -76,14 +77,14 @@ impl Host {
     pub fn start(kind: Kind, prepared: u64, size: u64) -> Result<Self, Box<dyn Error>> {
         // Not in memory, whatever the system's own choice is: journals are measured.
         let folder = tempfile::Builder::new().prefix("ambience-bench-").tempdir_in("/var/tmp")?;
-        Self::start_in(folder, kind, prepared, size)
+        Self::start_in(folder.into(), kind, prepared, size)
     }
 
     /// The same in the folder of one that was killed.
     ///
     /// # Errors
     /// When it does not come up.
-    pub fn start_in(folder: TempDir, kind: Kind, prepared: u64, size: u64) -> Result<Self, Box<dyn Error>> {
+    pub fn start_in(folder: Arc<TempDir>, kind: Kind, prepared: u64, size: u64) -> Result<Self, Box<dyn Error>> {
         let name = clap::ValueEnum::to_possible_value(&kind).ok_or("no such kind")?;
         let mut child = Command::new(std::env::current_exe()?)
             .args(["host", name.get_name()])
@@ -93,7 +94,7 @@ impl Host {
             .stdout(Stdio::piped())
             .spawn()?;
         let (ask, answers) = (child.stdin.take().ok_or("no stdin")?, child.stdout.take().ok_or("no stdout")?);
-        let mut host = Self { child, ask, answers: BufReader::new(answers), folder: Some(folder) };
+        let mut host = Self { child, ask, answers: BufReader::new(answers), folder };
         host.usage()?;
         Ok(host)
     }
@@ -102,26 +103,21 @@ impl Host {
     ///
     /// # Errors
     /// The system's.
-    pub fn kill(mut self) -> Result<TempDir, Box<dyn Error>> {
+    pub fn kill(mut self) -> Result<Arc<TempDir>, Box<dyn Error>> {
         self.child.kill()?;
         self.child.wait()?;
-        let folder = self.folder.take().ok_or("no folder")?;
-        std::fs::remove_file(socket(folder.path()))?;
-        Ok(folder)
-    }
-
-    fn folder(&self) -> &Path {
-        self.folder.as_ref().map_or(Path::new(""), TempDir::path)
+        std::fs::remove_file(socket(self.folder.path()))?;
+        Ok(self.folder.clone())
     }
 
     /// Where it listens.
     pub fn address(&self) -> String {
-        format!("unix:{}", socket(self.folder()).display())
+        format!("unix:{}", socket(self.folder.path()).display())
     }
 
     /// A new connection.
     pub fn connect(&self) -> Line {
-        let path = socket(self.folder());
+        let path = socket(self.folder.path());
         connect_with(move || UnixStream::connect(path.clone()))
     }
 

@@ -139,7 +139,8 @@ impl Frame {
         self.unfit.iter()
     }
 
-    /// Leases tiles to a worker that can do it, for one of the `threads` of all of them. `None` when there is nothing for it now.
+    /// Leases tiles to a worker, for one of the `threads` of all that can do the frame. `None` when there is nothing for it
+    /// now.
     pub fn lease(&mut self, lease: u64, worker: &Arc<str>, threads: u32, now: Duration) -> Option<v1::Lease> {
         if self.unfit.contains(worker) {
             return None;

@@ -15,8 +15,8 @@ use crate::spec::Job;
 /// workers finish a step together (guided self-scheduling).
 const SHARES: f64 = 2.0;
 
-/// What a lease should take at least, as far as is known: a small part of that is spent on giving it out. Where a whole step is little work,
-/// some of many workers get none of it.
+/// What a lease should take at least, as far as is known: a small part of that is spent on giving it out. Where a whole
+/// step is little work, some of many workers get none of it.
 const LEASE_LEAST: Duration = Duration::from_millis(10);
 
 /// A range of tiles a worker does.

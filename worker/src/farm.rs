@@ -1,7 +1,7 @@
 //! The worker process: leases work from a server, does it, says what came of it.
 //!
-//! Each of its threads works on one lease at a time, while it tells of the one before. What a lease yields depends on the frame, the step and the tiles alone,
-//! so a lease that is lost on the way is simply done again by somebody.
+//! Each of its threads works on one lease at a time, while it tells of the one before. What a lease yields depends on the
+//! frame, the step and the tiles alone, so a lease that is lost on the way is simply done again by somebody.
 
 use std::collections::BTreeSet;
 use std::hash::{BuildHasher as _, Hasher as _};
