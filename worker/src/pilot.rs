@@ -33,6 +33,13 @@ const A: f32 = 0.6;
 const RAYS: f32 = 0.4;
 const RAYS_RANGE: (f32, f32) = (64.0, 2048.0);
 
+/// What interpolation errs by at that a where probes cannot tell, relative to the picture's mean radiance: cornell, stairs and
+/// glossy-floor are within twice of it.
+const INTERPOLATION: f64 = 0.01;
+
+/// Pixels beyond which a picture has no more candidates for records.
+const PIXELS_TESTED: u64 = 1 << 18;
+
 /// Samples of each of the pilot's pixels.
 const SPP: u32 = 8;
 
@@ -104,7 +111,7 @@ pub fn choose(frame: Frame, error: f32) -> (Frame, Forecast) {
     // Mean squares relative to the mean radiance: sampling and noise for an effort of 1, interpolation at the pilot's a.
     let sampling = seen.deviation * most * most * SPREAD * WELL_SPREAD;
     let noise = seen.noise * f64::from(few).sqrt() / RECORDS_AT_ONCE * most * most;
-    let interpolation = seen.interpolation * most * most;
+    let interpolation = seen.interpolation.filled(asked.size()).believed(INTERPOLATION / most) * most * most;
     let [for_sampling, for_noise, for_interpolation] = if frame.levels() == 0 {
         [aim, f64::INFINITY, f64::INFINITY]
     } else {
@@ -166,11 +173,44 @@ struct Seen {
     deviation: f64,
     /// Standard error that records bring.
     noise: f64,
-    /// Mean square of what interpolation is off by.
-    interpolation: f64,
+    interpolation: Probed,
     rays_a_sample: f64,
     rays_of_fill: f64,
     counts: Counts,
+}
+
+/// Mean square of what interpolation is off by, (W/(sr m²))², as far as probes tell.
+#[derive(Clone, Copy, Default)]
+struct Probed {
+    /// May be negative: it is what noise does not explain.
+    mean: f64,
+    /// Variance of that mean.
+    variance: f64,
+}
+
+impl Probed {
+    fn of(squares: &[f64]) -> Self {
+        let n = squares.len().max(1) as f64;
+        let mean = squares.iter().sum::<f64>() / n;
+        let variance = squares.iter().map(|square| (square - mean).powi(2)).sum::<f64>() / (n * n);
+        Self { mean, variance }
+    }
+
+    /// The same of a picture of so many pixels, whose records lie nearer each other than those of the pilot's few. Fitted to
+    /// probes of cornell, stairs, glossy-floor and sphere-plane filled at 128², 256² and 512².
+    fn filled(self, pixels: u64) -> Self {
+        let looked_at = f64::from(PIXELS) / pixels.clamp(PIXELS.into(), PIXELS_TESTED) as f64;
+        let left = looked_at.powf(0.25);
+        Self { mean: self.mean * left, variance: self.variance * left * left }
+    }
+
+    /// The mean between what was seen and what is `usual`, the root of a mean square known to about itself, each weighed by how
+    /// well it is known: few rays say nothing of what lies below their noise.
+    fn believed(self, usual: f64) -> f64 {
+        let usual = usual * usual;
+        let known = usual * usual / (usual * usual + self.variance).max(f64::MIN_POSITIVE);
+        (usual + (self.mean - usual) * known).max(0.0)
+    }
 }
 
 fn look(frame: &Frame) -> Seen {
@@ -205,7 +245,7 @@ fn look(frame: &Frame) -> Seen {
 }
 
 /// Mean square by which interpolated radiance differs from gathered, less what noise of both explains.
-fn probe(frame: &Frame, levels: &Levels, counts: &mut Counts) -> f64 {
+fn probe(frame: &Frame, levels: &Levels, counts: &mut Counts) -> Probed {
     let settings = frame.settings();
     let mut random = Random::named("probe", &[settings.seed]);
     let mut place = |size: u32| ((random.uniform() * size as f32) as u32).min(size - 1);
@@ -219,7 +259,7 @@ fn probe(frame: &Frame, levels: &Levels, counts: &mut Counts) -> f64 {
         bands: Rays::Fixed(&bands),
         details: &settings.details,
     };
-    let (mut sum, mut found) = (0.0, 0);
+    let mut squares = Vec::with_capacity(PROBES);
     for _ in 0..PROBES {
         // Another point of the pixel than the one records are made for.
         let candidate = frame.site(1, 1, place(settings.width), place(settings.height), counts);
@@ -229,10 +269,9 @@ fn probe(frame: &Frame, levels: &Levels, counts: &mut Counts) -> f64 {
         alone.unite([&gather.record(gather.id(&site), &site, counts)]);
         let Some(truth) = alone.ask(&site.query(), &served) else { continue };
         let square = (truth.radiance - answer.radiance).length_squared() / 3.0;
-        sum += f64::from(square - truth.noise * truth.noise - answer.noise * answer.noise);
-        found += 1;
+        squares.push(f64::from(square - truth.noise * truth.noise - answer.noise * answer.noise));
     }
-    (sum / f64::from(found.max(1))).max(0.0)
+    Probed::of(&squares)
 }
 
 /// What was reached, as far as the finished picture itself can tell: sampling and noise are measured on all its pixels,
