@@ -176,6 +176,7 @@ enum End {
 struct Base {
     digest: Vec<u8>,
     records: u64,
+    filled: bool,
 }
 
 struct Render<'a> {
@@ -298,11 +299,12 @@ impl Render<'_> {
         server: &Address,
         frames: &Frames,
     ) -> Result<Result<Streaming<v1::FrameEvent>, End>, Failure> {
-        let base: Vec<u8> = self.base.as_ref().map_or_else(Vec::new, |base| base.digest.clone());
+        let (base, filled) =
+            self.base.as_ref().map_or_else(Default::default, |base| (base.digest.clone(), base.filled));
         let opening = client::retry(|| {
             let (spec, base) = (Some(job.spec.clone()), base.clone().into());
             let mut frames = frames.clone();
-            async move { frames.open(v1::OpenRequest { spec, base }).await }
+            async move { frames.open(v1::OpenRequest { spec, base, filled }).await }
         });
         tokio::pin!(opening);
         let slow = tokio::time::sleep(SLOW);
@@ -345,8 +347,9 @@ impl Render<'_> {
     }
 
     fn opened(&mut self, opened: v1::FrameOpened) {
-        let base = Base { digest: opened.base.to_vec(), records: opened.base_records };
-        if let Some(before) = self.base.as_ref().filter(|before| **before != base) {
+        let v1::FrameOpened { base: digest, base_records: records, filled, .. } = opened;
+        let base = Base { digest: digest.to_vec(), records, filled };
+        if let Some(before) = self.base.as_ref().filter(|before| before.digest != base.digest) {
             let (before, now) = (before.records, base.records);
             self.progress.note(&format!(
                 "warning: the picture was begun with {before} records of the server, which it lost; now with {now}: \

@@ -44,12 +44,33 @@ const REFINING_FROM: u32 = 64;
 /// Most passes that refine; Krivanek 2006 needed at most 11.
 pub const REFINING_MAX: u32 = 11;
 
+/// A level is full when every look was filled once and a pass gathers for less than one in so many of its candidates. Clamping
+/// uncovers a few more in each pass; finding them takes longer than what their pixels gather for themselves.
+const HOLES: u64 = 1024;
+
 /// Passes before the plan gives up on a level's last holes.
 pub const PASSES_MAX: u32 = 16;
 
 /// Rank of a pixel: bits of x^y and y interleaved, finest differences first.
 pub fn rank(x: u32, y: u32) -> u32 {
-    (0..RANK_BITS).fold(0, |rank, bit| rank << 2 | ((x ^ y) >> bit & 1) << 1 | y >> bit & 1)
+    static RANK: [[u16; PATTERN as usize]; PATTERN as usize] = pattern();
+    RANK[(y % PATTERN) as usize][(x % PATTERN) as usize].into()
+}
+
+const fn pattern() -> [[u16; PATTERN as usize]; PATTERN as usize] {
+    let mut pattern = [[0; PATTERN as usize]; PATTERN as usize];
+    let mut at = 0;
+    while at < RANKS {
+        let (x, y) = (at % PATTERN, at / PATTERN);
+        let (mut rank, mut bit) = (0, 0);
+        while bit < RANK_BITS {
+            rank = rank << 2 | ((x ^ y) >> bit & 1) << 1 | y >> bit & 1;
+            bit += 1;
+        }
+        pattern[y as usize][x as usize] = rank as u16;
+        at += 1;
+    }
+    pattern
 }
 
 /// One step of a frame.
@@ -69,7 +90,7 @@ pub enum Step {
 }
 
 /// Which point of its pixels a pass looks at: 0 their middle, 1 and so on others. After a round of looks it starts again,
-/// until every point is found covered.
+/// until hardly a point is found uncovered.
 pub fn look(level: u32, pass: u32) -> u32 {
     pass % looks(level)
 }
@@ -93,16 +114,14 @@ pub fn ranks(level: u32, pass: u32, pixels: u64) -> Range<u32> {
     from..from + count
 }
 
-/// Gives a frame's steps one after another: levels deepest first, each in passes until every look in turn gathers
-/// nothing, then the pixels.
+/// Gives a frame's steps one after another: levels deepest first, each in passes through all looks and on until one gathers
+/// next to nothing, then the pixels.
 #[derive(Clone, Debug)]
 pub struct Plan {
     adaptive: bool,
     pixels: u64,
     level: u32,
     pass: u32,
-    /// Passes in a row that gathered nothing.
-    quiet: u32,
     from: u32,
     gathered: u64,
     /// Passes over level 1 so far.
@@ -114,7 +133,7 @@ impl Plan {
     /// A plan for `levels` levels of records (0: pixels only) of a picture of so many pixels; an adaptive one has passes that
     /// refine.
     pub fn new(levels: u32, adaptive: bool, pixels: u64) -> Self {
-        Self { adaptive, pixels, level: levels, pass: 0, quiet: 0, from: 0, gathered: 0, passes: 0, done: false }
+        Self { adaptive, pixels, level: levels, pass: 0, from: 0, gathered: 0, passes: 0, done: false }
     }
 
     /// Passes over level 1 so far.
@@ -127,11 +146,10 @@ impl Plan {
     pub fn next(&mut self, gathered: u64) -> Option<Step> {
         self.gathered += gathered;
         if self.level > 0 && self.from == ranks(self.level, self.pass, self.pixels).end {
+            let full = self.pass >= self.passes_min() && self.gathered * HOLES <= self.candidates();
             self.pass += 1;
-            let unrefined = self.adaptive && self.level == 1 && self.pass <= LOOKS;
-            self.quiet = if self.gathered == 0 && !unrefined { self.quiet + 1 } else { 0 };
-            if self.quiet == looks(self.level) || self.pass == self.passes_max() {
-                (self.pass, self.quiet) = (0, 0);
+            if full || self.pass == self.passes_max() {
+                self.pass = 0;
                 self.level -= 1;
             }
             self.gathered = 0;
@@ -146,6 +164,17 @@ impl Plan {
             return Some(Step::Fill { level: self.level, pass: self.pass, ranks: from..self.from });
         }
         (!std::mem::replace(&mut self.done, true)).then_some(Step::Pixels)
+    }
+
+    /// Candidates of a pass, at most.
+    fn candidates(&self) -> u64 {
+        let ranks = ranks(self.level, self.pass, self.pixels).len() as u64;
+        self.pixels.saturating_mul(ranks) / u64::from(RANKS)
+    }
+
+    /// The first pass that may show a level to be full: the last look, or, where records shrink, the first that refines.
+    fn passes_min(&self) -> u32 {
+        if self.adaptive && self.level == 1 { LOOKS } else { looks(self.level) - 1 }
     }
 
     fn passes_max(&self) -> u32 {
@@ -202,14 +231,11 @@ mod tests {
 
     #[test]
     fn each_pass_tests_every_rank_once_deepest_level_first() {
-        let all = steps(2, |step| match step {
-            Step::Fill { pass: 0, .. } => 1,
-            _ => 0,
-        });
+        let all = steps(2, |_| 0);
         assert_eq!(all.last(), Some(&Step::Pixels));
         let mut expected = vec![];
         for level in [2, 1] {
-            for pass in 0..1 + looks(level) {
+            for pass in 0..looks(level) {
                 let mut at = 0;
                 for step in &all {
                     if let Step::Fill { level: l, pass: p, ranks } = step
@@ -248,22 +274,27 @@ mod tests {
     }
 
     #[test]
-    fn a_level_ends_when_every_look_gathers_nothing_or_gives_up() {
+    fn a_level_is_full_when_a_pass_gathers_next_to_nothing_or_gives_up() {
         assert_eq!(steps(0, |_| 0), [Step::Pixels]);
-        let passes =
-            |all: &[Step]| all.iter().filter(|s| matches!(s, Step::Fill { ranks, .. } if ranks.start == 0)).count();
-        assert_eq!(passes(&steps(1, |_| 0)), LOOKS as usize);
-        assert_eq!(passes(&steps(2, |_| 0)), (LOOKS + LOOKS_DEEPER) as usize);
-        assert_eq!(passes(&steps(1, |_| 1)), PASSES_MAX as usize);
-        // A hole found in the sixth pass asks for another turn of all looks.
-        let found = |step: &Step| u64::from(matches!(step, Step::Fill { pass: 5, .. }));
-        assert_eq!(passes(&steps(1, found)), LOOKS as usize);
-        let found = |step: &Step| u64::from(matches!(step, Step::Fill { pass: 0 | 2 | 5, .. }));
-        assert_eq!(passes(&steps(1, found)), 6 + LOOKS as usize);
+        // 2048 pixels: two holes in a pass are few, three are not.
+        let passes = |levels, found: &dyn Fn(u32) -> u64| {
+            let first = |ranks: &Range<u32>| ranks.start == 0;
+            let all = all_steps(Plan::new(levels, false, 2048), |step| match step {
+                Step::Fill { pass, ranks, .. } if first(ranks) => found(*pass),
+                _ => 0,
+            });
+            all.iter().filter(|step| matches!(step, Step::Fill { ranks, .. } if first(ranks))).count() as u32
+        };
+        assert_eq!(passes(1, &|_| 0), LOOKS);
+        assert_eq!(passes(2, &|_| 0), LOOKS + LOOKS_DEEPER);
+        assert_eq!(passes(1, &|_| 3), PASSES_MAX);
+        // What earlier looks found does not matter, and a look that found little is the last.
+        assert_eq!(passes(1, &|pass| if pass < 3 { 100 } else { 2 }), LOOKS);
+        assert_eq!(passes(1, &|pass| if pass < 5 { 3 } else { 2 }), 6);
     }
 
     #[test]
-    fn an_adaptive_plan_refines_level_1_until_every_look_is_quiet() {
+    fn an_adaptive_plan_refines_level_1_until_a_pass_finds_nothing() {
         let passes = |level: u32, found: &dyn Fn(&Step) -> u64| {
             let all = all_steps(Plan::new(2, true, 1), found);
             let pass = |step: &Step| match step {
@@ -275,10 +306,10 @@ mod tests {
         let refining = |passes: &[u32], level| passes.iter().filter(|pass| refines(level, **pass)).count() as u32;
         let nothing = passes(1, &|_| 0);
         // Looks that were not refined say nothing about steps.
-        assert_eq!((nothing.len() as u32, refining(&nothing, 1)), (2 * LOOKS, LOOKS));
+        assert_eq!((nothing.len() as u32, refining(&nothing, 1)), (LOOKS + 1, 1));
         assert_eq!(passes(2, &|_| 0).len() as u32, LOOKS_DEEPER);
-        let once = passes(1, &|step| u64::from(matches!(step, Step::Fill { pass: 5, .. })));
-        assert_eq!(refining(&once, 1), 2 + LOOKS);
+        let once = passes(1, &|step| u64::from(matches!(step, Step::Fill { pass: 4 | 5, .. })));
+        assert_eq!(refining(&once, 1), 3);
         // Without end, the holes of the last shrinking are still filled.
         let always = passes(1, &|_| 1);
         assert_eq!((always.len() as u32, refining(&always, 1)), (2 * LOOKS + REFINING_MAX, REFINING_MAX));

@@ -60,6 +60,8 @@ pub struct Origin {
     pub base: Mark,
     /// Where its own records go.
     pub draft: Namespace,
+    /// The base ends with what the same view gathered: only pixels are left to be made.
+    pub filled: bool,
 }
 
 /// One frame.
@@ -100,9 +102,10 @@ struct Outbox {
 impl Frame {
     /// A frame; `mark` tells the state of its draft, as far as the steps before the given one gathered it.
     pub fn new(id: u64, job: Job, origin: Origin, mark: impl FnOnce(u32) -> Mark) -> Self {
+        let levels = if origin.filled { 0 } else { job.spec.levels };
         let mut frame = Self {
             id,
-            plan: Plan::new(job.spec.levels, job.spec.adaptive, u64::from(job.spec.width) * u64::from(job.spec.height)),
+            plan: Plan::new(levels, job.spec.adaptive, u64::from(job.spec.width) * u64::from(job.spec.height)),
             job,
             origin,
             round: None,
@@ -278,11 +281,12 @@ impl Frame {
     fn event(&mut self, workers: u32, mark: impl FnOnce(u32) -> Mark) -> Option<Event> {
         let outbox = &mut self.outbox;
         if std::mem::take(&mut outbox.opening) {
-            let base = self.origin.base.sum;
+            let Origin { base: Mark { sum, .. }, filled, .. } = self.origin;
             return Some(Event::Opened(v1::FrameOpened {
                 frame: self.id,
-                base: convert::digest_bytes(base.digest),
-                base_records: base.records,
+                base: convert::digest_bytes(sum.digest),
+                base_records: sum.records,
+                filled,
             }));
         }
         if std::mem::take(&mut outbox.scene) {

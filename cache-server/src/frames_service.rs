@@ -111,7 +111,7 @@ impl Board {
 
     /// Opens a frame of a tenant: finds its base, begins its draft. Returns its number.
     async fn open(&self, tenant: &Tenant, request: v1::OpenRequest) -> Result<(u64, Namespace), Refusal> {
-        let v1::OpenRequest { spec, base } = request;
+        let v1::OpenRequest { spec, base: before, filled } = request;
         let job = Job::check(spec.ok_or(Refusal::Malformed(Malformed::Missing("spec")))?)?;
         let namespace = job.namespace;
         self.store.replica().belongs(&namespace, tenant.name())?;
@@ -121,21 +121,29 @@ impl Board {
                 "is the draft of a frame, expected that of a scene and its settings",
             ));
         }
-        let base = if base.is_empty() {
-            self.store.mark(&namespace)
-        } else {
-            self.base(&namespace, convert::digest(&base)?).await
+        let before = if before.is_empty() { None } else { Some(convert::digest(&before)?) };
+        let base = match before {
+            None => self.store.mark(&namespace),
+            Some(digest) => self.base(&namespace, digest).await,
         };
         let effort = job.spec.effort.map(|effort| v1::Effort { samples: 0.0, ..effort });
         let view = v1::FrameSpec { scene: String::new(), spp: 0, splat: false, effort, ..job.spec.clone() };
         let view = [view.encode_to_vec(), cache_proto::VERSION.into()].concat();
-        let draft = namespace.draft(base.sum.digest, &view);
+        let draft_after = |digest| namespace.draft(digest, &view);
+        let draft = draft_after(base.sum.digest);
+        let filled = match before {
+            // Publications may be lost with a server: what the first attempt was told counts.
+            Some(digest) if digest == base.sum.digest => filled,
+            _ => self.store.replica().is_filled(&namespace, base.position, draft_after),
+        };
         if job.spec.levels > 0 {
             self.store.label(label(&job, tenant.name(), namespace, None)).await?;
-            self.store.label(label(&job, tenant.name(), draft, Some(namespace))).await?;
+            if !filled {
+                self.store.label(label(&job, tenant.name(), draft, Some(namespace))).await?;
+            }
             self.store.hold(draft);
         }
-        let origin = Origin { tenant: tenant.clone(), base, draft };
+        let origin = Origin { tenant: tenant.clone(), base, draft, filled };
         let opened = self.change(|frames, _| frames.open(job, origin, |draft, step| self.mark(draft, step)));
         if opened.is_err() {
             self.store.release(&draft);

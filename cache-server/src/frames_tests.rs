@@ -244,7 +244,7 @@ fn lease(frames: &mut Frames, worker: &str, seconds: u64) -> Option<v1::Lease> {
 
 fn opened(frames: &mut Frames, spec: v1::FrameSpec) -> Result<u64, Refusal> {
     let job = Job::check(spec).expect("sound");
-    let origin = Origin { tenant: Tenant::default(), base: Mark::default(), draft: job.namespace };
+    let origin = Origin { tenant: Tenant::default(), base: Mark::default(), draft: job.namespace, filled: false };
     frames.open(job, origin, |_, _| Mark::default())
 }
 
@@ -548,7 +548,7 @@ fn a_step_reads_what_lower_steps_gathered_and_a_filled_draft_is_told_once() {
         state(step)
     };
     let namespace = job.namespace;
-    let frame = frames.open(job, Origin { tenant: Tenant::default(), base, draft }, mark).expect("room");
+    let frame = frames.open(job, Origin { tenant: Tenant::default(), base, draft, filled: false }, mark).expect("room");
     let (mut filled, mut steps) = (vec![], 0);
     while let Some(work) = lease(&mut frames, "a", 0) {
         let step = work.step.expect("a step");
@@ -578,6 +578,28 @@ fn a_step_reads_what_lower_steps_gathered_and_a_filled_draft_is_told_once() {
     let Some(Event::Done(done)) = told.last() else { panic!("{told:?}") };
     assert_eq!(done.records, 7 + u64::from(steps));
     assert_eq!(convert::digest(&done.digest).expect("16 bytes").0, 70 + u128::from(steps));
+}
+
+#[test]
+fn a_frame_whose_base_is_filled_makes_pixels_alone_and_publishes_nothing() {
+    let mut frames = Frames::new(Limits::default(), 1);
+    let job = Job::check(spec(1, 3)).expect("sound");
+    let (base, draft) = (Mark::default(), Namespace([9; 32]));
+    let origin = Origin { tenant: Tenant::default(), base, draft, filled: true };
+    let frame = frames.open(job, origin, |_, _| Mark::default()).expect("room");
+    let work = lease(&mut frames, "a", 0).expect("work");
+    assert_eq!(work.step.as_ref().map(|step| (step.index, step.level)), Some((0, 0)));
+    let tiles = vec![v1::FrameTile { tile: 0, pixels: vec![0; 4 * 12].into() }];
+    let request =
+        v1::CompleteRequest { worker: "a".into(), lease: work.id, frame: work.frame, tiles, ..Default::default() };
+    assert!(frames.complete(request, Duration::ZERO, |_, _| Mark::default()).expect("sound"));
+    assert_eq!(frames.take_changes().filled, None);
+    let mut told = vec![];
+    while let News::Tell(event) = frames.news(frame, |_, _| Mark::default()) {
+        told.extend(event.event);
+    }
+    assert!(matches!(&told[0], Event::Opened(opened) if opened.filled));
+    assert!(matches!(told.last(), Some(Event::Done(done)) if done.rounds == 0), "{told:?}");
 }
 
 #[test]

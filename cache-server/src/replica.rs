@@ -287,6 +287,17 @@ impl Replica {
         Some(Mark { position: position as u64, sum: set.prefix(position) })
     }
 
+    /// Whether the log up to a position ends with what a frame gathered whose draft was `draft` of the digest before it: then a
+    /// frame of the same view finds everything.
+    pub fn is_filled(&self, namespace: &Namespace, position: u64, draft: impl Fn(Digest) -> Namespace) -> bool {
+        let Some(set) = self.set(namespace) else { return false };
+        let last = |published: &Published| {
+            published.namespace == *namespace && published.range.end as u64 == position && !published.range.is_empty()
+        };
+        let mut last = self.published.iter().filter(|(_, published)| last(published));
+        last.any(|(name, published)| *name == draft(set.prefix(published.range.start).digest))
+    }
+
     /// Where a subscription begins that holds `position` records of `digest`: there, or at 0 if this log has others.
     pub fn resume(&self, namespace: &Namespace, position: u64, digest: Digest) -> u64 {
         let same = |set: &RecordSet| {
@@ -600,6 +611,26 @@ mod tests {
         replica.publish(draft, NAMESPACE).expect("room");
         replica.hold(draft);
         assert_eq!(replica.mark(&draft).sum, replica.mark(&NAMESPACE).sum);
+    }
+
+    #[test]
+    fn a_log_that_ends_with_what_a_view_gathered_is_filled_for_it() {
+        let mut replica = Replica::new(Limits::default());
+        let draft_of = |view: u8| move |base: Digest| NAMESPACE.draft(base, &[view]);
+        let mut fill = |view, records: Vec<Record>| {
+            let draft = draft_of(view)(replica.mark(&NAMESPACE).sum.digest);
+            replica.insert(draft, Tag::level(1), &records).expect("room");
+            replica.publish(draft, NAMESPACE).expect("room");
+            [1, 2].map(|view| replica.is_filled(&NAMESPACE, replica.mark(&NAMESPACE).position, draft_of(view)))
+        };
+        assert_eq!(fill(1, vec![record(1, 0.0), record(2, 0.0)]), [true, false]);
+        assert_eq!(fill(2, vec![record(3, 0.0)]), [false, true]);
+        // Nothing came of it: what the second view lacks is not known.
+        assert_eq!(fill(1, vec![]), [false, true]);
+        assert!(replica.is_filled(&NAMESPACE, 2, draft_of(1)) && !replica.is_filled(&NAMESPACE, 1, draft_of(1)));
+        // Records of others stand between.
+        replica.insert(NAMESPACE, Tag::level(1), &[record(9, 0.0)]).expect("room");
+        assert!(!replica.is_filled(&NAMESPACE, 4, draft_of(2)));
     }
 
     #[test]

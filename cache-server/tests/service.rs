@@ -332,7 +332,7 @@ fn spec() -> v1::FrameSpec {
 }
 
 fn open() -> v1::OpenRequest {
-    v1::OpenRequest { spec: Some(spec()), base: Default::default() }
+    v1::OpenRequest { spec: Some(spec()), ..Default::default() }
 }
 
 fn ask(worker: &str) -> v1::LeaseRequest {
@@ -408,7 +408,14 @@ async fn a_frame_is_filled_by_two_workers_and_told_to_its_owner() {
     assert_eq!(info.namespaces[0].label.as_ref().map(|l| l.scene.as_str()), Some("box.glb"));
     let mut again = soon(frames.open(open())).await.expect("opened").into_inner();
     let told = soon(again.message()).await.expect("no error").expect("told").event;
-    assert!(matches!(told, Some(Event::Opened(opened)) if opened.base_records == 3 && opened.base == done.digest));
+    assert!(matches!(told, Some(Event::Opened(o)) if o.base_records == 3 && o.base == done.digest && o.filled));
+    // Begun again after the loss of a server, it is what it was.
+    for filled in [false, true] {
+        let request = v1::OpenRequest { base: done.digest.clone(), filled, ..open() };
+        let mut again = soon(frames.open(request)).await.expect("opened").into_inner();
+        let told = soon(again.message()).await.expect("no error").expect("told").event;
+        assert!(matches!(told, Some(Event::Opened(o)) if o.base_records == 3 && o.filled == filled));
+    }
     let described = soon(frames.describe(v1::DescribeRequest { frame: frame.expect("opened") })).await;
     assert!(described.is_err_and(|status| status.code() == Code::NotFound), "a finished frame is forgotten");
     server.stop().await;

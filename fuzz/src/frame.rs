@@ -125,7 +125,8 @@ impl Board {
     fn open(&mut self, spec: v1::FrameSpec) {
         let Ok(job) = Job::check(spec) else { return };
         assert_eq!((0..job.tiles.min(64)).map(|t| job.pixels(t)).filter(|pixels| *pixels == 0).count(), 0);
-        let origin = Origin { tenant: Tenant::default(), base: Mark::default(), draft: Namespace([3; 32]) };
+        let origin =
+            Origin { tenant: Tenant::default(), base: Mark::default(), draft: Namespace([3; 32]), filled: false };
         self.open.extend(self.frames.open(job, origin, |_, _| Mark::default()));
     }
 

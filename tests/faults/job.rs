@@ -210,8 +210,8 @@ pub struct Reference {
     pub gathered: Vec<RecordId>,
 }
 
-/// Renders a frame from a base, with nobody in between.
-pub fn reference(spec: &v1::FrameSpec, base: &[(Tag, Record)]) -> Reference {
+/// Renders a frame from a base, which may be `filled` already, with nobody in between.
+pub fn reference(spec: &v1::FrameSpec, base: &[(Tag, Record)], filled: bool) -> Reference {
     let frame = MadeUp::new(spec.clone()).expect("our own");
     let mut levels: Levels = (0..spec.levels).map(|_| Level::new(spec.a, Details::default())).collect();
     for (tag, record) in base {
@@ -219,7 +219,8 @@ pub fn reference(spec: &v1::FrameSpec, base: &[(Tag, Record)]) -> Reference {
     }
     let nothing: Known = Arc::new(|_| None);
     let size = u64::from(spec.width) * u64::from(spec.height);
-    let (mut plan, mut gathered, mut last) = (Plan::new(spec.levels, spec.adaptive, size), Vec::new(), 0);
+    let (mut plan, mut gathered, mut last) =
+        (Plan::new(if filled { 0 } else { spec.levels }, spec.adaptive, size), Vec::new(), 0);
     while let Some(step @ Step::Fill { level, .. }) = plan.next(last) {
         let tiles = 0..frame.tiles();
         let one = |tile| [frame.fill(&step, tile, &levels, &nothing).0, frame.proposals(&step, tile, &levels)].concat();

@@ -49,6 +49,8 @@ enum End {
 /// The base a frame was begun with.
 struct Base {
     digest: Digest,
+    /// Its frame found everything there.
+    filled: bool,
     /// How often the disk had been lost when its frame was opened.
     losses: u32,
     /// `None`: it could not be found out.
@@ -92,10 +94,10 @@ async fn render(farm: &Rc<Farm>, spec: &v1::FrameSpec) -> u64 {
 fn check(farm: &Farm, spec: &v1::FrameSpec, base: Option<Base>, tiles: &[Vec<u8>], done: &v1::FrameDone) {
     events::note("owner", format_args!("done: {} records, {} leases lost", done.records, done.leases_lost));
     // Whoever opened it before the disk was lost and could not know the records cannot know the picture either.
-    let Some(Base { records: Some(records), losses, .. }) = base else {
+    let Some(Base { records: Some(records), losses, filled, .. }) = base else {
         return events::note("owner", "picture not checked");
     };
-    let expected = reference(spec, &records);
+    let expected = reference(spec, &records, filled);
     let all = (records.len() + expected.gathered.len()) as u64;
     if done.records != all {
         events::wrong(format_args!("a picture read {} records, expected {all}", done.records));
@@ -115,11 +117,11 @@ fn check(farm: &Farm, spec: &v1::FrameSpec, base: Option<Base>, tiles: &[Vec<u8>
 
 async fn attempt(farm: &Rc<Farm>, spec: &v1::FrameSpec, base: &mut Option<Base>) -> End {
     let frames = client::frames(connect());
-    let asked = base.as_ref().map_or_else(Default::default, |base| convert::digest_bytes(base.digest));
+    let asked = base.as_ref().map(|base| (convert::digest_bytes(base.digest), base.filled)).unwrap_or_default();
     let opening = client::retry(|| {
-        let (spec, base) = (Some(spec.clone()), asked.clone());
+        let (spec, (base, filled)) = (Some(spec.clone()), asked.clone());
         let mut frames = frames.clone();
-        async move { frames.open(v1::OpenRequest { spec, base }).await }
+        async move { frames.open(v1::OpenRequest { spec, base, filled }).await }
     });
     let mut away = farm.away.subscribe();
     let mut events = match opening.await {
@@ -194,6 +196,9 @@ fn opened_with(farm: &Rc<Farm>, spec: &v1::FrameSpec, base: &mut Option<Base>, o
     let losses = farm.disk.losses();
     match base {
         Some(base) if base.digest == digest => base.losses = losses,
-        _ => *base = Some(Base { digest, losses, records: farm.disk.prefix(&namespace(spec.levels), digest) }),
+        _ => {
+            let records = farm.disk.prefix(&namespace(spec.levels), digest);
+            *base = Some(Base { digest, filled: opened.filled, losses, records });
+        }
     }
 }
