@@ -11,7 +11,9 @@ use std::process::{ChildStdin, Command, Stdio};
 use std::time::Instant;
 
 use clap::ValueEnum;
+use glam::Vec3;
 use serde::Deserialize;
+use worker::scene;
 
 use crate::host::children;
 use crate::judge::{self, Reference, SIZE, judge, reduce, reference};
@@ -20,6 +22,9 @@ use crate::results::{Point, Results};
 
 /// Errors that Ambience is asked for, cheapest first.
 const ERRORS: [f32; 6] = [0.1, 0.05, 0.03, 0.02, 0.01, 0.005];
+
+/// How far aside the view is that fills a cache for the second, over the diagonal of the scene's box.
+const STEP: f32 = 0.05;
 
 /// Arguments of the benchmark.
 #[derive(Clone, Debug, clap::Args)]
@@ -46,6 +51,8 @@ pub struct PeersArgs {
 enum Renderer {
     /// `ambience render --error`
     Ambience,
+    /// The same with the cache a view from a step aside has filled
+    SecondView,
     /// Radiance, with an ambient file
     Rpict,
     /// Mitsuba 3's path tracer
@@ -82,7 +89,8 @@ pub fn run(args: &PeersArgs) -> Result<(), Box<dyn Error>> {
                 results.put(Point::new(scene, args.edge, renderer, setting, [cpu, wall], &verdict));
             };
             let versions = match renderer {
-                Renderer::Ambience => ours(&files, args, &mut keep)?,
+                Renderer::Ambience => ours(&files, args, None, &mut keep)?,
+                Renderer::SecondView => ours(&files, args, Some(&files.aside()?), &mut keep)?,
                 _ => theirs(&name, &files.radiance, args, &mut keep)?,
             };
             results.versions.extend(versions);
@@ -114,6 +122,21 @@ impl Files {
         Ok(Self { radiance, ambience, truth: reference(&format!("{scene}.full")), ward })
     }
 
+    /// The view of the scene's .vf from a step to the right, as text of a .vf.
+    fn aside(&self) -> Result<String, Box<dyn Error>> {
+        let path = self.radiance.with_extension("vf");
+        let (view, camera) = (std::fs::read_to_string(&path)?, scene::load_view(&path)?);
+        let positions = scene::load(&self.radiance)?.triangles.into_iter().flat_map(|t| t.positions);
+        let (low, high) = positions.fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), position| {
+            (low.min(position), high.max(position))
+        });
+        let eye = camera.eye + camera.right.normalize() * STEP * (high - low).length();
+        let words: Vec<_> = view.split_whitespace().collect();
+        let at = words.iter().position(|word| *word == "-vp").ok_or("a .vf without -vp")?;
+        let moved = eye.to_array().map(|x| x.to_string());
+        Ok([&words[..=at], &moved.each_ref().map(String::as_str), &words[at + 4..]].concat().join(" "))
+    }
+
     fn truth(&self, renderer: Renderer) -> &Reference {
         let ward = if renderer == Renderer::Rpict { self.ward.as_ref() } else { None };
         ward.unwrap_or(&self.truth)
@@ -141,16 +164,31 @@ pub(crate) fn timed(command: &mut Command) -> Result<[f64; 2], Box<dyn Error>> {
     if status.success() { Ok(seconds) } else { Err(format!("{command:?}: {status}").into()) }
 }
 
-/// The program as users run it.
-fn ours(files: &Files, args: &PeersArgs, keep: Keep) -> Result<Vec<(String, String)>, Box<dyn Error>> {
+/// The program as users run it; after another `view` has filled its cache, if there is one.
+fn ours(
+    files: &Files,
+    args: &PeersArgs,
+    view: Option<&str>,
+    keep: Keep,
+) -> Result<Vec<(String, String)>, Box<dyn Error>> {
     let program = program()?;
-    let folder = tempfile::tempdir()?;
-    let picture = folder.path().join("picture.exr");
     for error in ERRORS.into_iter().take(args.rungs) {
-        let mut command = Command::new(&program);
-        command.arg("render").arg(&files.ambience).arg("-o").arg(&picture).arg("--quiet");
-        command.args(["--error", &error.to_string(), "--size", &format!("{0}x{0}", args.edge)]);
-        let [wall, cpu] = timed(&mut command)?;
+        let folder = tempfile::tempdir()?;
+        let [picture, cache, aside] = ["picture.exr", "cache", "aside.vf"].map(|name| folder.path().join(name));
+        let command = || {
+            let mut command = Command::new(&program);
+            command.arg("render").arg(&files.ambience).arg("-o").arg(&picture).arg("--quiet");
+            command.args(["--error", &error.to_string(), "--size", &format!("{0}x{0}", args.edge)]);
+            if view.is_some() {
+                command.arg("--cache").arg(&cache);
+            }
+            command
+        };
+        if let Some(view) = view {
+            std::fs::write(&aside, view)?;
+            timed(command().arg("--camera").arg(&aside))?;
+        }
+        let [wall, cpu] = timed(&mut command())?;
         let image: Vec<_> = worker::film::read(&picture)?.rgb.into_iter().map(|p| p.map(f64::from)).collect();
         keep(&format!("--error {error}"), cpu, wall, &image);
     }

@@ -109,8 +109,7 @@ impl Random {
 
     /// The numbers that belong to anything else with a name: a purpose and integers (a pixel, a sample, a seed).
     pub fn named(purpose: &str, numbers: &[u64]) -> Self {
-        // A key costs half of a derived one: names are hashed for every candidate.
-        let mut hasher = blake3::Hasher::new_keyed(b"ambience: random numbers, second");
+        let mut hasher = blake3::Hasher::new_derive_key("ambience random v1");
         for n in numbers {
             hasher.update(&n.to_le_bytes());
         }
