@@ -15,7 +15,7 @@ use worker::frame::Frame;
 use worker::pilot::{self, Errors, Forecast};
 use worker::scene::{self, Scene};
 use worker::scenes;
-use worker::settings::{ALL_BOUNCES, Settings};
+use worker::settings::{ALL_BOUNCES, Effort, Settings};
 use worker::spec;
 use worker::task;
 use worker::world::World;
@@ -23,7 +23,7 @@ use worker::world::World;
 use crate::args::RenderArgs;
 use crate::children::{Children, Event, how};
 use crate::failure::Failure;
-use crate::familiar;
+use crate::familiar::{self, Found};
 use crate::progress::{Progress, phase_name};
 use crate::say;
 use crate::stats::{Stats, hex};
@@ -104,14 +104,15 @@ async fn render(args: &RenderArgs, credentials: Credentials, children: &mut Chil
         }
         None => (frame, None),
     };
-    let job = job(args, &frame, forecast)?;
+    let mut job = job(args, &frame, forecast)?;
     drop(frame);
     for warning in &job.warnings {
         progress.note(&format!("warning: {warning}"));
     }
     let declined = HashSet::new();
     let mut render = Render { args, credentials, children, stats, progress, spare: RESTARTS, base: None, declined };
-    let (film, done) = render.picture(&job).await?;
+    let server = render.start(&mut job).await?;
+    let (film, done) = render.picture(&job, server).await?;
     // Reaped first, so that their memory is in the statistics.
     render.children.stop().await;
     render.write(&job, film, &done).await
@@ -124,6 +125,27 @@ struct Job {
     warnings: Vec<String>,
     /// The error asked for, and what the pilot made of it.
     forecast: Option<(f32, Forecast)>,
+}
+
+impl Job {
+    /// Takes the settings of records there are, which reach the error asked for as well.
+    fn adopt(&mut self, label: &v1::Label) {
+        let Some(before) = self.settings.effort else { return };
+        let effort = Effort { rays: label.rays_by_deviation, least_rays: label.least_rays, ..before };
+        let settings = Settings { a: label.a, effort: Some(effort), ..self.settings.clone() };
+        // Another build's may be something else.
+        let hash: Option<[u8; 32]> = self.spec.scene_hash.as_ref().try_into().ok();
+        if hash.is_none_or(|hash| settings.namespace(&hash).0 != *label.namespace) {
+            return;
+        }
+        if let Some((_, forecast)) = &mut self.forecast {
+            forecast.errors.noise *= f64::from(before.rays / effort.rays).sqrt();
+            forecast.errors.interpolation *= f64::from(settings.a / self.settings.a).powi(2);
+        }
+        let Effort { rays, least_rays, samples } = effort;
+        (self.spec.a, self.spec.effort) = (settings.a, Some(v1::Effort { rays, least_rays, samples }));
+        (self.spec.namespace, self.settings) = (label.namespace.clone(), settings);
+    }
 }
 
 /// Runs what takes long without holding up the runtime.
@@ -197,8 +219,7 @@ impl Render<'_> {
     /// Renders the frame, from its beginning again whenever the server was lost: what depends on nothing but the scene,
     /// the settings and the records it began with comes out the same. What was gathered before comes back from the
     /// server's disk or from its workers.
-    async fn picture(&mut self, job: &Job) -> Result<(Film, v1::FrameDone), Failure> {
-        let mut server = self.start(job).await?;
+    async fn picture(&mut self, job: &Job, mut server: Address) -> Result<(Film, v1::FrameDone), Failure> {
         loop {
             let mut film = Film::new(&job.settings);
             match self.attempt(job, &server, &mut film).await? {
@@ -226,8 +247,8 @@ impl Render<'_> {
         }
     }
 
-    /// Starts what is to be started: the server's address.
-    async fn start(&mut self, job: &Job) -> Result<Address, Failure> {
+    /// Starts what is to be started: the server's address. What its cache has may change the job's settings.
+    async fn start(&mut self, job: &mut Job) -> Result<Address, Failure> {
         self.stats.phase("start");
         self.progress.phase("starting");
         let server = match &self.args.server {
@@ -235,10 +256,11 @@ impl Render<'_> {
             None => self.children.start_server(self.args.transport, self.args.cache.as_deref()).await?,
         };
         if let Some(cache) = &self.args.cache {
-            familiar::note(&server, &self.credentials, &job.spec, cache)
-                .await?
-                .iter()
-                .for_each(|note| self.progress.note(note));
+            match familiar::look(&server, &self.credentials, &job.spec, cache).await? {
+                Found::Nothing => {}
+                Found::Near(label) => job.adopt(&label),
+                Found::Foreign(note) => self.progress.note(&note),
+            }
         }
         self.stats.workers = self.args.workers().into();
         for _ in 0..self.args.workers() {

@@ -3,8 +3,9 @@
 mod processes;
 
 use std::path::Path;
-use std::process::Stdio;
+use std::process::{Command, Stdio};
 
+use ambience_bench::judge::file;
 use processes::{Run, alive, ambience, busy_worker, children, collect, render, signal, wait_for};
 
 /// A render with a cache directory, and what it said.
@@ -53,6 +54,33 @@ fn a_second_render_gathers_nothing_and_a_moved_camera_only_what_it_newly_sees() 
     // Records another view added clamp those of the first here and there: it mends a few holes.
     let (back, _) = cached(cache.path(), "cornell.glb", &[]);
     assert!(back.gathered() * 100 < first.count("total"), "{}", back.stats);
+}
+
+#[test]
+fn a_moved_camera_finds_records_of_settings_a_step_from_its_own() {
+    let cache = tempfile::tempdir().expect("temporary directory");
+    let view = cache.path().join("aside.vf");
+    std::fs::write(&view, "rvu -vtv -vp 0.32 0.25 -0.8 -vd -0.03 0.01 1 -vu 0 1 0 -vh 41 -vv 35\n").expect("written");
+    let asked = |more: &[&str]| {
+        let directory = tempfile::tempdir().expect("temporary directory");
+        let mut command = Command::new(env!("CARGO_BIN_EXE_ambience"));
+        command.arg("render").arg(file("scenes").join("cornell.glb")).arg("-o").arg(directory.path().join("out.exr"));
+        command.arg("--stats").arg(directory.path().join("stats.json"));
+        command.args(["--quiet", "--size", "96x96", "--error", "0.3"]).args(more);
+        assert!(command.status().expect("ambience starts").success());
+        collect(directory.path())
+    };
+    let (view, kept) = (view.to_str().expect("UTF-8"), cache.path().join("cache"));
+    let kept = ["--cache", kept.to_str().expect("UTF-8")];
+    let rays = |run: &Run| run.stats["settings"]["rays_by_deviation"].as_f64().expect("a number");
+    let (alone, first) = (asked(&["--camera", view]), asked(&kept));
+    assert!(rays(&alone) != rays(&first), "the pilot chose the same for both: other views show it");
+    let moved = asked(&[&kept[..], &["--camera", view]].concat());
+    assert_eq!((rays(&moved), moved.count("base")), (rays(&first), first.count("total")), "{}", moved.stats);
+    assert!(moved.gathered() * 4 < alone.count("total"), "{}", moved.stats);
+    // The same view is the same picture still.
+    let again = asked(&[&kept[..], &["--camera", view]].concat());
+    assert!(again.gathered() == 0 && again.exr == moved.exr, "{}", again.stats);
 }
 
 #[test]

@@ -329,6 +329,7 @@ fn label(job: &Job, tenant: &str, namespace: Namespace, draft_of: Option<Namespa
         a: spec.a,
         rays: spec.rays,
         rays_by_deviation: spec.effort.map_or(0.0, |effort| effort.rays),
+        least_rays: spec.effort.map_or(0, |effort| effort.least_rays),
         bounces: spec.bounces,
         seed: spec.seed,
         owner: tenant.into(),

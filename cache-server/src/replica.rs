@@ -89,7 +89,7 @@ impl Replica {
         match entry {
             Checked::Batch(namespace, tag, records) => self.insert(namespace, tag, &records),
             Checked::Label(namespace, draft_of, label) => {
-                self.label(namespace, draft_of, label).map(|()| Added::default())
+                self.label(namespace, draft_of, *label).map(|()| Added::default())
             }
             Checked::Publication { draft, namespace } => self.publish(draft, namespace),
         }
@@ -499,7 +499,7 @@ mod tests {
 
     fn label(namespace: Namespace, draft_of: Option<Namespace>, owner: &str) -> Checked {
         let label = v1::Label { owner: owner.into(), ..Default::default() };
-        Checked::Label(namespace, draft_of, label)
+        Checked::Label(namespace, draft_of, Box::new(label))
     }
 
     fn gathered(step: u32, ids: Range<u32>) -> Checked {

@@ -91,7 +91,7 @@ fn short(kind: u8, bytes: &[u8]) -> Option<Checked> {
         4 => {
             let draft_of = (second % 2 == 1).then(|| namespace(second >> 1));
             let label = v1::Label { seed: second.into(), ..Default::default() };
-            Some(Checked::Label(namespace(first), draft_of, label))
+            Some(Checked::Label(namespace(first), draft_of, Box::new(label)))
         }
         _ => {
             let tag = Tag { level: 1 + u32::from(second % 4), step: (second >> 4).into() };

@@ -178,7 +178,7 @@ pub enum Checked {
     /// Records of a namespace.
     Batch(Namespace, Tag, Vec<Record>),
     /// What a namespace is; second, for a draft, whose.
-    Label(Namespace, Option<Namespace>, v1::Label),
+    Label(Namespace, Option<Namespace>, Box<v1::Label>),
     /// A draft belongs to a namespace from now on.
     Publication {
         /// Whose records.
@@ -215,7 +215,7 @@ pub fn entry(entry: &v1::Entry) -> Result<Checked, Malformed> {
                 }
             }
             let draft_of = (!label.draft_of.is_empty()).then(|| namespace(&label.draft_of)).transpose()?;
-            Ok(Checked::Label(namespace(&label.namespace)?, draft_of, label.clone()))
+            Ok(Checked::Label(namespace(&label.namespace)?, draft_of, Box::new(label.clone())))
         }
         Some(v1::entry::Entry::Publication(publication)) => {
             let (draft, namespace) = (namespace(&publication.draft)?, namespace(&publication.namespace)?);

@@ -106,6 +106,8 @@ struct LabelLine {
     rays: u32,
     #[serde(default)]
     rays_by_deviation: f32,
+    #[serde(default)]
+    least_rays: u32,
     bounces: u32,
     seed: u64,
     owner: String,
@@ -150,6 +152,7 @@ pub fn write(out: &mut impl Write, entry: &Entry) -> io::Result<()> {
             a: label.a,
             rays: label.rays,
             rays_by_deviation: label.rays_by_deviation,
+            least_rays: label.least_rays,
             bounces: label.bounces,
             seed: label.seed,
             owner: label.owner,
@@ -222,6 +225,7 @@ fn entry(line: &[u8]) -> Result<Entry, String> {
                 a: line.a,
                 rays: line.rays,
                 rays_by_deviation: line.rays_by_deviation,
+                least_rays: line.least_rays,
                 bounces: line.bounces,
                 seed: line.seed,
                 owner: line.owner,

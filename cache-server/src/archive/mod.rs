@@ -162,7 +162,9 @@ impl Archive {
                 let batch = (!new.is_empty()).then(|| convert::pack(&namespace, tag, &new));
                 batch.map(|batch| v1::Entry { entry: Some(Kind::Batch(batch)) })
             }
-            Checked::Label(namespace, _, label) => (self.replica.label_of(&namespace) != Some(&label)).then_some(entry),
+            Checked::Label(namespace, _, label) => {
+                (self.replica.label_of(&namespace) != Some(&*label)).then_some(entry)
+            }
             Checked::Publication { draft, namespace } => {
                 (!self.publications.contains(&(draft, namespace))).then_some(entry)
             }
