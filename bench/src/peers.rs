@@ -21,7 +21,7 @@ use crate::own;
 use crate::results::{Point, Results};
 
 /// Errors that Ambience is asked for, cheapest first.
-const ERRORS: [f32; 6] = [0.1, 0.05, 0.03, 0.02, 0.01, 0.005];
+const ERRORS: [f32; 7] = [0.1, 0.05, 0.03, 0.02, 0.015, 0.01, 0.005];
 
 /// How far aside the view is that fills a cache for the second, over the diagonal of the scene's box.
 const STEP: f32 = 0.05;
