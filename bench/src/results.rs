@@ -115,7 +115,7 @@ impl Results {
         std::fs::create_dir_all(report::file(""))?;
         std::fs::write(file("json"), serde_json::to_string_pretty(self)?)?;
         std::fs::write(file("md"), self.table())?;
-        report::logarithmic(&self.name, "CPU seconds", report::SeriesLabelPosition::LowerLeft, &self.panels())
+        report::logarithmic(&self.name, "CPU seconds", report::SeriesLabelPosition::UpperRight, &self.panels())
     }
 
     /// The pictures of each scene and size, by renderer.
