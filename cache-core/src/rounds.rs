@@ -44,7 +44,7 @@ const REFINING_FROM: u32 = 64;
 /// Most passes that refine; Krivanek 2006 needed at most 11.
 pub const REFINING_MAX: u32 = 11;
 
-/// A level is full when every look was filled once and a pass gathers for less than one in so many of its candidates. Clamping
+/// A level is full when every look was filled once and a pass gathers for at most one in so many of its candidates. Clamping
 /// uncovers a few more in each pass; finding them takes longer than what their pixels gather for themselves.
 const HOLES: u64 = 1024;
 

@@ -190,9 +190,13 @@ struct Probed {
 
 impl Probed {
     fn of(squares: &[f64]) -> Self {
-        let n = squares.len().max(1) as f64;
+        // One alone does not show how far it is off.
+        if squares.len() < 2 {
+            return Self { mean: 0.0, variance: f64::INFINITY };
+        }
+        let n = squares.len() as f64;
         let mean = squares.iter().sum::<f64>() / n;
-        let variance = squares.iter().map(|square| (square - mean).powi(2)).sum::<f64>() / (n * n);
+        let variance = squares.iter().map(|square| (square - mean).powi(2)).sum::<f64>() / (n * (n - 1.0));
         Self { mean, variance }
     }
 
@@ -284,5 +288,31 @@ pub fn reached(counts: &Counts, forecast: &Forecast) -> Errors {
         sampling: (sums.sampling / pixels).sqrt() / mean,
         noise: (sums.noise_squared / pixels).sqrt() / mean,
         interpolation: forecast.errors.interpolation,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn probes_are_believed_as_far_as_they_agree() {
+        let usual = 0.01;
+        let believed = |squares: &[f64]| Probed::of(squares).believed(usual).sqrt();
+        assert_eq!((believed(&[]), believed(&[9.0])), (usual, usual));
+        assert_eq!(believed(&[4e-4; 8]), 0.02);
+        assert_eq!(believed(&[-4e-4; 8]), 0.0);
+        // Of mean 4e-4, by chance as well.
+        let scattered = believed(&[1.0, -0.9992]);
+        assert!((scattered - usual).abs() < 1e-4, "{scattered}");
+    }
+
+    #[test]
+    fn a_large_picture_errs_less_between_its_records_than_the_pilot() {
+        let seen = Probed { mean: 16.0, variance: 256.0 };
+        let filled = |pixels| (seen.filled(pixels).mean, seen.filled(pixels).variance);
+        assert_eq!((filled(100), filled(u64::from(PIXELS))), ((16.0, 256.0), (16.0, 256.0)));
+        assert_eq!(filled(16 * u64::from(PIXELS)), (8.0, 64.0));
+        assert_eq!(filled(1 << 30), filled(PIXELS_TESTED));
     }
 }
